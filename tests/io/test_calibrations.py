@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torchcss.body.rotations import about
 from torchcss.errors import CameraError
+from torchcss.io.calibrations import read_entries
 from torchcss.io.cameras import load_camera, read_cameras
 from torchcss.io.video import VideoWriter
 
@@ -435,3 +437,88 @@ def test_pair_of_matlabs(tmp_path: Path) -> None:
     pair = {"CameraParameters1": camera, "CameraParameters2": camera}
     matlab.savemat(tmp_path / "a.mat", {"errors": {"mean": 0.3}, "stereoParams": pair})
     check(tmp_path / "a.mat", name="2")
+
+
+PLACED = {"R": np.array(about(1, np.array(-0.5))).tolist(), "t": [0.2, -0.1, 2.5]}
+PROJECTION = np.array(K) @ np.column_stack([PLACED["R"], PLACED["t"]])
+
+
+def is_placed(path: Path, name: str | None = None) -> None:
+    found = load_camera(path, name)
+    assert found.metric
+    np.testing.assert_allclose(found.camera.K, K, atol=1e-6)
+    np.testing.assert_allclose(found.camera.R_camera_world, PLACED["R"], atol=1e-9)
+    np.testing.assert_allclose(found.camera.t_camera_world, PLACED["t"], atol=1e-9)
+
+
+@pytest.mark.parametrize("factor", [1.0, -0.37])
+def test_projection_matrices_are_taken_apart(tmp_path: Path, factor: float) -> None:
+    one = {"P": (factor * PROJECTION).tolist(), "image_size_wh": [640, 480]}
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"units": "m", "cameras": {"a": one, "b": {"x": 1}}}))
+    is_placed(path, "a")
+    path.write_text(json.dumps({"P": np.ones((3, 4)).tolist(), "image_size_wh": [640, 480]}))
+    with pytest.raises(CameraError, match=r"a\.json: not a camera's projection matrix"):
+        load_camera(path)
+
+
+@pytest.mark.parametrize("form", ["4 x 4", "3 x 4", "in columns", "apart"])
+def test_places_in_one_matrix(tmp_path: Path, form: str) -> None:
+    pose = np.vstack([np.column_stack(list(PLACED.values())), [0, 0, 0, 1]])
+    said: dict[str, Any] = {
+        "4 x 4": {"extrinsics": pose.tolist()},
+        "3 x 4": {"RT": pose[:3].tolist()},
+        "in columns": {"extrinsic": pose.T.ravel().tolist()},
+        "apart": {"extrinsics": {"rotation": PLACED["R"], "translation": PLACED["t"]}},
+    }[form]
+    K_by = np.ravel(np.transpose(K) if form == "in columns" else K).tolist()
+    one = {"intrinsic": {"width": 640, "height": 480, "intrinsic_matrix": K_by}, **said}
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"units": "m", "cameras": {"a": one}}))
+    is_placed(path)
+
+
+def rows(matrix: Any) -> str:
+    return "\n".join(" ".join(map(str, row)) for row in np.asarray(matrix).tolist())
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        (rows(PROJECTION), None),
+        ("CONTOUR\n" + rows(PROJECTION), None),
+        ("".join(f"P{i}: {' '.join(map(str, PROJECTION.ravel()))}\n" for i in range(3))
+         + "R0_rect: 1 0 0 0 1 0 0 0 1\n", "2"),
+        (f"calib_time: 09-Jan-2012 13:57:47\nK_02: {' '.join(map(str, np.ravel(K)))}\n"
+         "D_02: 0 0 0 0 0\nP_rect_02: 7 0 6 0 0 7 2 0 0 0 1 0\n", "02"),
+        (f"# oST version 5.0 parameters\n[image]\n\nwidth\n640\n\nheight\n480\n\n[left/cam]\n\n"
+         f"camera matrix\n{rows(K)}\n\ndistortion\n0 0 0 0 0\n\nprojection\n7 0 6 0\n0 7 2 0\n"
+         "0 0 1 0\n", None),
+    ],
+)  # fmt: skip
+def test_numbers_as_text(tmp_path: Path, text: str, name: str | None) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text(text)
+    entry = read_entries(path)[name or "calib"]
+    np.testing.assert_allclose(np.reshape(entry.K, (3, 3)), K, atol=1e-6)
+    assert entry.rotation is None
+    assert entry.image_size_wh == ([640, 480] if "width" in text else None)
+
+
+@pytest.mark.parametrize("form", ["beside", "below", "prefix", "VINS", "ones of a fisheye lens"])
+def test_cameras_wherever_they_stand(tmp_path: Path, form: str) -> None:
+    single = dict(zip(("fx", "fy", "cx", "cy"), (FX, FY, CX, CY), strict=True))
+    size, path = {"image_width": 640, "image_height": 480}, tmp_path / "a.yaml"
+    content: dict[str, Any] = {
+        "beside": {"version": "1", "a": {"resolution": [640, 480], "intrinsics": single}},
+        "below": {"n": 1, "params": {"a": {"K_mx": K, "img_w": 640, "img_h": 480}}, "notes": [1]},
+        "prefix": {f"Camera.{k}": v for k, v in {**single, "width": 640, "height": 480}.items()},
+        "VINS": {"model_type": "PINHOLE", **size, "projection_parameters": single},
+        "ones of a fisheye lens": {"fisheye_params": {"camera_matrix": K, **size}},
+    }[form]
+    path.write_text(json.dumps(content))
+    if form == "ones of a fisheye lens":
+        with pytest.raises(CameraError, match="fisheye"):
+            load_camera(path)
+    else:
+        check(path, [0.0] * 5)

@@ -10,11 +10,13 @@
 | OpenPose | XML with `Intrinsics`, a file or a folder of them |
 | Kalibr | YAML: `cam0` with `intrinsics` |
 | COLMAP | `cameras.txt` or `cameras.bin`, or their folder |
+| KITTI, ROS | `.txt`: numbers below or behind what they are |
 | MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
-| arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`: the nine numbers of K |
+| arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone |
 
 Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
-the corner of the image, MATLAB's from 1; both are brought to pixel centres at integers.
+the corner of the image, MATLAB's from 1; both are brought to pixel centres at integers. A 3 x 4
+matrix P that projects points of the world is taken apart; matrices by columns are turned.
 
 Call `read_entries`.
 """
@@ -40,6 +42,7 @@ from torchcss.files import (
     load_array,
     load_arrays,
     load_json,
+    naming,
     one_line,
     read_bytes,
     read_text,
@@ -68,6 +71,7 @@ class Entry(NamedTuple):
         video: Name of the video.
         fisheye: Whether the lens is one that is not supported.
         note: What was assumed, for the user.
+        name: What the camera calls itself.
     """
 
     K: Any
@@ -79,12 +83,13 @@ class Entry(NamedTuple):
     video: Any = None
     fisheye: Any = False
     note: str | None = None
+    name: Any = None
 
 
 _WORDS = {
     "K": names_in(
         "k matrix cameramatrix cammatrix camatrix mtx cammtx cameramtx kmatrix intrinsicmatrix "
-        "intrinsicsmatrix m intrinsic intrinsics cameraintrinsic cameraintrinsics "
+        "intrinsicsmatrix m kmx intrinsic intrinsics cameraintrinsic cameraintrinsics "
         "cameraintrinsicmatrix calibrationmatrix"
     ),
     "rotation": names_in("r rotation rot rvec rotationmatrix rotationvector"),
@@ -92,7 +97,11 @@ _WORDS = {
 }  # fmt: skip
 """What a camera's numbers are called (`torchcss.io.keypoints.words`), the first that is there."""
 
-_DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs)$")
+_PROJECTIONS = names_in("p projectionmatrix pmatrix projmat projection proj")
+_POSES = names_in("extrinsic extrinsics extrinsicmatrix extrinsicsmatrix rt w2c worldtocamera")
+"""What all numbers together are called, and rotation and translation."""
+
+_DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs|dvec)$")
 """How the name of a lens's coefficients begins, or all of it."""
 
 _ONE_BY_ONE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
@@ -103,13 +112,18 @@ _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _SHAPES = ("img_shape", "image_shape", "ImageSize", "shape")
 """What height and width are called where they are given in this order; the third is MATLAB's."""
 
-_SIDES = (*SIDES, ("w", "h"), ("cols", "rows"))
+_SIDES = (*SIDES, ("w", "h"), ("imgw", "imgh"), ("cols", "rows"))
 _NAMES = names_in("name cameraname cameraid camid id serial serialnumber")
 _MODELS = names_in(
     "distortionmodel cameramodel model cameratype distortiontype lensmodel lens lenstype "
     "projection type"
 )
 _FISHEYE = re.compile("equidist|fish_?eye|kannala|omni|eucm|fov|^ds$|^ds-|-ds$", re.IGNORECASE)
+
+_ROUNDING = 1e-3
+"""Skew that is taken for rounding, in focal lengths."""
+
+_FISHEYE_NUMBERS = re.compile("fish_?eye_?(param|model|coeff)", re.IGNORECASE)
 
 _MOST_BYTES = 2**26
 """Bytes of the largest calibration, unpacked; MATLAB's hold the pictures' corners too."""
@@ -149,7 +163,8 @@ def read_entries(path: Path) -> dict[str, Entry]:
             names = ", ".join((INTRINSICS, *_OF_COLMAP))
             raise CameraError(f"{path}: no calibration in this folder; expected {names} or .xml")
         return {name: entry for file in files for name, entry in read_entries(file).items()}
-    return _READERS.get(path.suffix.lower(), _read_json)(path)
+    with naming(path, CameraError):
+        return _READERS.get(path.suffix.lower(), _read_json)(path)
 
 
 # The same things in other words.
@@ -157,10 +172,21 @@ def read_entries(path: Path) -> dict[str, Entry]:
 
 def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     """A camera of a mapping, by whatever words it uses."""
-    inner = first_of(values, ("intrinsics", "intrinsic"))
-    if isinstance(inner, Mapping):  # a mapping of its own
-        values = {**values, "intrinsics": None, "intrinsic": None, **inner}
+    for words in (("intrinsics", "intrinsic", "projectionparameters"), ("extrinsics", "extrinsic")):
+        inner = first_of(values, words)
+        if isinstance(inner, Mapping) and "data" not in inner:  # a mapping of its own
+            rest = {key: each for key, each in values.items() if plain_word(key) not in words}
+            values = {**rest, **inner}
     found = {key: _plain(first_of(values, words)) for key, words in _WORDS.items()}
+    if found["rotation"] is None and (pose := _square(first_of(values, _POSES), 4)) is not None:
+        found |= {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
+    if (K := _square(found["K"], 3)) is not None:
+        found["K"] = K.tolist()
+    projection = first_of(values, _PROJECTIONS) if found["K"] is None else found["K"]
+    if (projection := _square(projection, 4)) is not None:
+        parts = _parts_of(projection[:3])
+        # Of K with a column of zeros the place is not known.
+        found |= parts if projection[:3, 3].any() else {"K": parts["K"]}
     named = {key: value for key, value in values.items() if plain_word(key) not in _MODELS}
     lenses = [_plain(named[key]) for key in named if _DISTORTION.match(plain_word(key))]
     lens = next((each for each in lenses if each is not None), None)
@@ -175,7 +201,40 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     fisheye = values.get("fisheye", False) or any(map(_FISHEYE.search, models))
     size, video = _said_size(values), values.get("video")
     return Entry(**found, image_size_wh=size, distortion=lens, units=units, video=video,
-                 fisheye=fisheye)  # fmt: skip
+                 fisheye=fisheye, name=values.get("name"))  # fmt: skip
+
+
+def _square(value: Any, size: int) -> np.ndarray | None:
+    """A square matrix given by rows or by columns, or by rows without the last; None: it is none.
+
+    Its last row is 0, ..., 0, 1.
+    """
+    with suppress(CameraError):
+        numbers = real_numbers(_plain(value), "", CameraError).ravel()
+        if numbers.size == size * (size - 1) and size == 4:
+            return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
+        if numbers.size == size * size:
+            matrix = numbers.reshape(size, size)
+            by_columns = matrix[-1, :-1].any() and not matrix[:-1, -1].any()
+            return matrix.T if by_columns else matrix
+    return None
+
+
+def _parts_of(projection: np.ndarray) -> dict[str, Any]:
+    """K, rotation and translation of a 3 x 4 matrix that projects points of the world."""
+    with refusing(CameraError, "not a camera's projection matrix"):
+        projection = projection * np.sign(np.linalg.det(projection[:, :3]))
+        turn, inverse = np.linalg.qr(np.linalg.inv(projection[:, :3]))
+        signs = np.diag(np.sign(np.diag(inverse)))
+        inverse = signs @ inverse
+        K = np.triu(np.linalg.inv(inverse))
+    K /= K[2, 2]
+    if abs(K[0, 1]) < _ROUNDING * K[0, 0]:
+        K[0, 1] = 0
+    rotation, translation = (turn @ signs).T, inverse @ projection[:, 3]
+    return {
+        "K": K.tolist(), "rotation": rotation.tolist(), "translation": translation.tolist()
+    }  # fmt: skip
 
 
 def _said_size(values: Mapping[str, Any]) -> Any:
@@ -219,14 +278,31 @@ def _from_corner(numbers: Sequence[Any]) -> list[Any]:
 
 
 def _has_camera(values: object) -> bool:
-    return isinstance(values, Mapping) and (
-        first_of(values, _WORDS["K"]) is not None
+    if not isinstance(values, Mapping):
+        return False
+    K = first_of(values, (*_WORDS["K"], "projectionparameters"))
+    if isinstance(K, Mapping) and "data" not in K:
+        return _has_camera(K)
+    return (
+        K is not None
+        or _square(first_of(values, _PROJECTIONS), 4) is not None
         or any(set(names) <= values.keys() for names in _ONE_BY_ONE)
     )
 
 
-def _are_cameras(values: object) -> bool:
-    return isinstance(values, Mapping) and bool(values) and all(map(_has_camera, values.values()))
+def _cameras_in(values: object) -> dict[str, Mapping[str, Any]]:
+    """Cameras by name, whatever stands beside or above them."""
+    if not isinstance(values, Mapping):
+        return {}
+    found = {str(name): each for name, each in values.items() if _has_camera(each)}
+    for name, each in found.items():
+        if _FISHEYE_NUMBERS.match(name):
+            found[name] = {**each, "fisheye": True}
+    for name, each in values.items():
+        if str(name) not in found:
+            below = _cameras_in(each).items()
+            found |= {f"{name}/{n}" if n in found else n: camera for n, camera in below}
+    return found
 
 
 def _numbered(values: object) -> dict[str, dict[str, Any]]:
@@ -238,7 +314,7 @@ def _numbered(values: object) -> dict[str, dict[str, Any]]:
     pair = {
         name: own
         for name, own in found.items()
-        if isinstance(first_of(own, _WORDS["K"]), (list, dict))
+        if isinstance(first_of(own, (*_WORDS["K"], *_PROJECTIONS)), (list, dict))
     }
     return {name: {**values, **own} for name, own in pair.items()}  # type: ignore[dict-item]
 
@@ -258,28 +334,32 @@ def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
 
 def _read_json(path: Path) -> dict[str, Entry]:
     content = load_json(path, CameraError)
-    if isinstance(content, list):
-        content = dict[str, Any](cameras=content)
-    cameras = content.get("cameras") if isinstance(content, dict) else None
-    if isinstance(content, dict) and "RadialDistortion" in content and _is_matlabs(content):
+    return _read_content(path, {"cameras": content} if isinstance(content, list) else content)
+
+
+def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entry]:
+    """The only camera of a file, or cameras by name or in a list; their unit if none is said."""
+    if not isinstance(content, dict):
+        raise unexpected(CameraError, path, "an object 'cameras' with one under each name", content)
+    if "RadialDistortion" in content and _is_matlabs(content):
         return {path.stem: _matlab_entry(path, content)}
+    cameras = content.get("cameras")
     if cameras is None and (_has_camera(content) or _numbered(content)):
         return _alone(path, content)
-    if cameras is None and _are_cameras(content):
-        cameras = content
     if isinstance(cameras, list) and all(isinstance(each, dict) for each in cameras):
         names = [str(first_of({**each, "#": n}, (*_NAMES, "#"))) for n, each in enumerate(cameras)]
         if len(set(names)) < len(names):
             raise CameraError(f"{path}: two cameras of one name among {', '.join(names)}")
         cameras = dict(zip(names, cameras, strict=True))
+    # Others are not calibrated.
+    cameras = _cameras_in(content if cameras is None else cameras) or cameras
     if not isinstance(cameras, dict):
-        raise unexpected(
-            CameraError, path, "an object 'cameras' with a camera under each name", content
-        )
+        known = "'names' (EasyMocap), camera_matrix (OpenCV, ROS), cam0 (Kalibr) or cameras by name"
+        raise unexpected(CameraError, path, known, list(content))
     for name, values in cameras.items():
-        if not isinstance(values, dict):
+        if not isinstance(values, Mapping):
             raise unexpected(CameraError, f"{path}: camera {name!r}", "an object", values)
-    return {name: _entry(values, content.get("units")) for name, values in cameras.items()}
+    return {str(n): _entry(each, content.get("units", units)) for n, each in cameras.items()}
 
 
 def _read_toml(path: Path) -> dict[str, Entry]:
@@ -287,20 +367,12 @@ def _read_toml(path: Path) -> dict[str, Entry]:
     text = read_text(path, CameraError)
     with refusing(CameraError, f"{path}: cannot be read as TOML"):
         content = tomllib.loads(text)
-    tables = content["cameras"] if isinstance(content.get("cameras"), dict) else content
-    tables = {
-        name: each
-        for name, each in tables.items()
-        if isinstance(each, dict) and name not in ("metadata", "charuco")
-    }
-    if any(map(_has_camera, tables.values())):  # others are not calibrated
-        tables = {name: each for name, each in tables.items() if _has_camera(each)}
     entries: dict[str, Entry] = {}
-    for table, values in tables.items():
-        name = values.get("name", table)
+    for table, entry in _read_content(path, content, "metre").items():
+        name = table if entry.name is None else entry.name
         if not isinstance(name, str) or name in entries:
             raise unexpected(CameraError, f"{path}: table {table!r}", "a name of its own", name)
-        entries[name] = _entry(values)
+        entries[name] = entry
     metadata = content.get("metadata", {})
     if isinstance(metadata, dict) and "units" in metadata:
         units = metadata["units"]
@@ -329,17 +401,26 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
 
 
 def _read_text(path: Path) -> dict[str, Entry]:
-    """COLMAP's cameras, or the matrix K alone."""
-    rows = {
-        f"{path}: line {number}": re.split(r"[\s,;]+", line.strip(" \t,;[]"))
+    """COLMAP's cameras, a matrix alone, or numbers below or behind what they are (ROS, KITTI)."""
+    lines = {
+        f"{path}: line {number}": line.strip(" \t,;[]")
         for number, line in enumerate(read_text(path, CameraError).splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     }
-    try:
-        numbers = [float(word) for row in rows.values() for word in row]
-    except ValueError:
-        numbers = []
-    return _alone(path, {"K": numbers}) if len(numbers) == 9 else _colmap_entries(rows)
+    found: dict[str, list[float]] = {}
+    word = ""
+    for line in lines.values():
+        if match := re.fullmatch(r"([A-Za-z]\w*+(?: \w++)*+)?+:?([-+0-9.eE\s,;]*)", line):
+            word = match[1] or word
+            with suppress(ValueError):
+                numbers = map(float, re.split(r"[\s,;]+", match[2].strip(" \t,;")))
+                found.setdefault(word, []).extend(numbers)
+    values: dict[str, Any] = {w: n[0] if len(n) == 1 else n for w, n in found.items()}
+    if len(found) == 1 and len(*found.values()) in (9, 12):
+        values = {"K": next(iter(found.values()))}
+    if _has_camera(values) or _numbered(values):
+        return _alone(path, values)
+    return _colmap_entries({w: re.split(r"[\s,;]+", line) for w, line in lines.items()})
 
 
 def _colmap_entries(rows: Mapping[str, Sequence[str]]) -> dict[str, Entry]:
@@ -390,15 +471,7 @@ def _read_yaml(path: Path) -> dict[str, Entry]:
     chain = {name: each for name, each in content.items() if re.fullmatch(r"cam[0-9]+", name)}
     if chain and all(map(_has_camera, chain.values())):
         return _kalibr(path, chain)
-    if _has_camera(content) or _numbered(content):
-        return _alone(path, content)
-    cameras = content.get("cameras", content)
-    if _are_cameras(cameras):
-        return {str(name): _entry(each) for name, each in cameras.items()}
-    raise CameraError(
-        f"{path}: expected 'names', as EasyMocap writes them, 'camera_matrix' (OpenCV, ROS) or "
-        f"'cam0' (Kalibr), found {shortened(list(content))}"
-    )
+    return _read_content(path, content)
 
 
 def _kalibr(path: Path, chain: Mapping[str, Mapping[str, Any]]) -> dict[str, Entry]:
@@ -454,7 +527,7 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
     for each in [each for each in values.values() if isinstance(each, dict)]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
-        if _are_cameras(pair):
+        if all(map(_has_camera, pair.values())):
             return {n: _matlab_entry(path, each) for n, each in pair.items() if each is not None}
         values = each if _is_matlabs(each) else values
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
@@ -494,7 +567,6 @@ def _matlab_entry(path: Path, values: Mapping[str, Any]) -> Entry:
             (fx, fy), (cx, cy) = values["FocalLength"], values["PrincipalPoint"]
             found = found._replace(K=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         K = np.array(found.K, float)
-        K = K.T if K[2, 0] or K[2, 1] else K  # old ones have the principal point below
         K[:2, 2] -= 1
         radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [0, 0])))
         tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [0, 0])))
@@ -593,7 +665,8 @@ def _load(path: Path) -> dict[str, Any]:
             f"{path}: no calibration; expected names, camera_matrix or cam0, found "
             f"{shortened(content)}"
         )
-    return {str(key): value for key, value in content.items()}
+    # ORB-SLAM's have a common word before each.
+    return {re.sub(r"^Camera1?\.", "", str(key)): value for key, value in content.items()}
 
 
 _READERS = {

@@ -8,7 +8,6 @@ JSON; percent of the picture; people are the boxes that points hang on.
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -47,7 +46,7 @@ def _people(where: str, points: Iterable[Point], *, known: bool = True) -> list[
         joints = people.setdefault(who, {})
         if label in joints:
             raise KeypointError(f"{where}: {label!r} twice; tell people apart, as by a group_id")
-        joints[label] = [float(u), float(v), 1.0]
+        joints[label] = real_numbers([u, v, 1.0], where, KeypointError).tolist()
     return [Person.by_name(joints, who if known else None) for who, joints in people.items()]
 
 
@@ -105,32 +104,24 @@ def read_via_table(heading: Sequence[str], rows: Iterable[tuple[int, Sequence[st
 
 def _via_people(found: Regions) -> People:
     """People of the points of pictures, each with its attributes."""
-    points = {
-        name: [
-            (shape, about)
-            for shape, about in regions
-            if isinstance(shape, dict) and isinstance(about, dict) and shape.get("name") == "point"
-        ]
-        for name, regions in found.items()
-    }
     values: dict[str, set[str]] = {}
-    for _, about in itertools.chain(*points.values()):
-        for key, value in about.items():
-            values.setdefault(key, set()).add(_ticked(value))
-
-    def is_joint(key: str) -> tuple[int, int]:
-        return sum(canonical_joint_name(each) is not None for each in values[key]), len(values[key])
-
-    joint = max(values, key=is_joint, default="")
-
-    def point(where: str, shape: Mapping[str, Any], about: Mapping[str, Any]) -> Point:
-        who = track_of({key: _ticked(value) for key, value in about.items() if key != joint})
-        place = real_numbers([shape.get("cx"), shape.get("cy")], where, KeypointError)
-        return who, _ticked(about.get(joint)), place.tolist()
-
+    marks: dict[str, list[tuple[dict[str, str], Sequence[float]]]] = {}
+    with refusing(KeypointError, "not VIA's regions"):
+        for name, regions in found.items():
+            marks[name] = [
+                ({key: _ticked(each) for key, each in about.items()}, (shape["cx"], shape["cy"]))
+                for shape, about in regions
+                if shape.get("name") == "point"
+            ]
+            for key, value in (item for about, _ in marks[name] for item in about.items()):
+                values.setdefault(key, set()).add(value)
+    known = {key: sum(map(bool, map(canonical_joint_name, own))) for key, own in values.items()}
+    joint = max(values, key=lambda key: (known[key], len(values[key])), default="")
     frames: Frames = {
-        name: _people(name, [point(name, *each) for each in regions])
-        for name, regions in points.items()
+        name: _people(
+            name, [(track_of({**about, joint: ""}), about.get(joint, ""), uv) for about, uv in own]
+        )
+        for name, own in marks.items()
     }
     people, names = united(frames)
     return People(people, names, [f"format: VIA, joints by {joint!r}"], whole=True)

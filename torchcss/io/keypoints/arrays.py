@@ -51,11 +51,10 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     """
     texts = {key: each for key, each in arrays.items() if each.dtype.kind in "SU"}
     numbers = {key: each for key, each in arrays.items() if key not in texts}
-    name = first_of({key: key for key in numbers}, _PLACES)
-    if len(arrays) == 1:
-        (name,) = arrays
+    alone = len(arrays) == 1
+    name = next(iter(arrays)) if alone else first_of({key: key for key in numbers}, _PLACES)
     array, counts = _numbered(arrays.get(name or "", np.zeros(0)))
-    if len(arrays) == 1 and is_landmark_array(array):
+    if alone and is_landmark_array(array):
         return read_landmark_array(name or "", array)
     if name is None:
         raise KeypointError(
@@ -64,7 +63,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         )
     report = [f"format: {path.suffix[1:].upper()}"]
     values = _people(name, array)
-    from_movenet = is_movenet(array, alone=len(arrays) == 1)
+    from_movenet = is_movenet(array, alone=alone)
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")

@@ -18,11 +18,11 @@ import numpy as np
 from torchcss.errors import KeypointError, optional_package
 from torchcss.files import read_bytes, refusing
 from torchcss.io.keypoints.h36m import PlainUnpickler
-from torchcss.io.keypoints.people import Frames, People, Person, is_there, screened
+from torchcss.io.keypoints.people import Frames, People, Person, screened
+from torchcss.io.keypoints.tables import people_of_rows
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MOST_NUMBERS = 2**26
-_KINDS = ("x", "y", "likelihood")
 
 _SLEAP_ADVICE = (
     "export it from SLEAP as 'Analysis HDF5' or 'Analysis CSV' (sleap-convert --format analysis)"
@@ -120,23 +120,13 @@ def _read_pandas(path: Path, group: Any) -> People:
         # Of labelled pictures the last level is the name.
         pictures = [row[-1] for row in _levels(path, group, "axis1")]
         index = pictures or _array(path, group["axis1"]).tolist()
-    # Scorer, individual where there are several, body part and kind.
-    columns = [tuple(map(str, column)) for column in columns]
-    several = len(columns[0]) > 3
-    who = list(dict.fromkeys(column[-3] if several else "" for column in columns))
-    names = list(dict.fromkeys(column[-2] for column in columns))
-    joints = np.full((len(values), len(who), len(names), 3), np.nan)
-    for number, (*_, person, name, kind) in enumerate(columns):
-        if kind in _KINDS:
-            place = who.index(person) if several else 0
-            joints[:, place, names.index(name), _KINDS.index(kind)] = values[:, number]
-    found = screened(joints[..., :2], joints[..., 2])
-    frames: Frames = {
-        key: [Person(p, w or None) for p, w in zip(people, who, strict=True) if is_there(p)]
-        for key, people in zip(map(_key, index), found, strict=True)
-    }
-    report = [f"format: DeepLabCut, {len(who)} individual{'s' * (len(who) > 1)}"]
-    return People(frames, tuple(names), report, first=0)
+    # As the rows of its CSV.
+    levels = [*zip(*(map(str, column) for column in columns), strict=True)][1:]
+    titles = ("individuals", "bodyparts", "coords")[-len(levels) :]
+    heads = [[title, *level] for title, level in zip(titles, levels, strict=True)]
+    keys = [key.decode() if isinstance(key, bytes) else f"{key}" for key in index]
+    rows = [[key, *map(repr, row)] for key, row in zip(keys, values.tolist(), strict=True)]
+    return people_of_rows([*enumerate([*heads, *rows], start=1)])
 
 
 def _levels(path: Path, group: Any, axis: str) -> list[tuple[str, ...]]:
@@ -145,10 +135,3 @@ def _levels(path: Path, group: Any, axis: str) -> list[tuple[str, ...]]:
     labels = (_array(path, group[key.replace("level", "label")]) for key in levels)
     texts = (np.array(_texts(path, group[key])) for key in levels)
     return [*zip(*(t[label] for t, label in zip(texts, labels, strict=True)), strict=True)]
-
-
-def _key(index: float | bytes | str) -> int | str:
-    """A frame's number, or the name of its picture."""
-    if isinstance(index, bytes):
-        return index.decode()
-    return index if isinstance(index, str) else int(index)

@@ -111,14 +111,7 @@ def people_of_rows(rows: list[Row]) -> People:
         columns = columns._replace(frame=0)
     elif len(who) == 1 < len(rows) - 1 and said and not "".join(*who)[:1].isdecimal():
         columns = columns._replace(frame=None, time=None)  # the name of the video
-    used = {each for parts in columns.parts.values() for each in parts.values()}
-    found = [heading[parts[2]] for parts in columns.parts.values() if 2 in parts]
-    report = ["no confidence in the file: 1 for every joint that has a place other than (0, 0)"]
-    if found:
-        report = [f"confidence: columns such as {found[0]}"]
-    others = {*range(columns.size)} - used - {columns.frame, columns.joint, columns.track}
-    if left := [heading[index] for index in sorted(others) if heading[index]]:
-        report.append(f"columns left out: {shortened(', '.join(left))}")
+    report = _told(columns, heading)
     joints, frames = _read_rows(columns, rows[1:])
     if columns.time is not None:
         frames = in_seconds(columns.time, frames)
@@ -131,6 +124,19 @@ def people_of_rows(rows: list[Row]) -> People:
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
     return People(people, names, report, first=first)
+
+
+def _told(columns: _Columns, heading: Sequence[str]) -> list[str]:
+    """What to report of the columns."""
+    used = {each for parts in columns.parts.values() for each in parts.values()}
+    found = [heading[parts[2]] for parts in columns.parts.values() if 2 in parts]
+    report = ["no confidence in the file: 1 for every joint that has a place other than (0, 0)"]
+    if found:
+        report = [f"confidence: columns such as {found[0]}"]
+    others = {*range(columns.size)} - used - {columns.frame, columns.joint, columns.track}
+    if left := [heading[index] for index in sorted(others) if heading[index]]:
+        report.append(f"columns left out: {shortened(', '.join(left))}")
+    return report
 
 
 def rows_of_json(content: object) -> list[Row] | None:
