@@ -387,7 +387,7 @@ def pack_limbs(body: BodyModel, density: BodyDensity) -> Limbs:
         row=row,
         place=place,
         above=above,
-        end=end,
+        end=np.ascontiguousarray(end),
         difference=np.take_along_axis(difference, end, 1),
         moves=above @ (difference != 0).T,
         fixed=array(which.fixed),
