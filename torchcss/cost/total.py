@@ -188,15 +188,26 @@ class TrackingCost:
 
     def problem(self) -> SearchProblem:
         """What a tracker searches: the cost, its coarse and its cheap relative, and the rest."""
+        past = self._of_those([term.name for term in self.choice.terms if term.of_past])
+        motion = self._of_those([term.name for term in self.choice.terms if term.of_motion])
+        return self._problem(self.coarse(), self.screening(), past, motion)
+
+    def _problem(self, *relatives: TrackingCost | None) -> SearchProblem:
+        coarse, screening, past, motion = relatives
+
+        def restrict(items: Indices) -> SearchProblem:
+            some = (None if cost is None else cost.take(items) for cost in relatives)
+            return self.take(items)._problem(*some)
+
         return SearchProblem(
             cost=self,
-            coarse=self.coarse(),
-            screening=self.screening(),
+            coarse=coarse,
+            screening=screening,
             weight_only=self.weight_only,
-            past=self._of_those([term.name for term in self.choice.terms if term.of_past]),
-            motion=self._of_those([term.name for term in self.choice.terms if term.of_motion]),
+            past=past,
+            motion=motion,
             landmarks=self.landmarks,
-            restrict=lambda items: self.take(items).problem(),
+            restrict=restrict,
             of_children=lambda *given: self.of_children(*given).problem(),
         )
 

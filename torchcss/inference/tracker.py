@@ -388,12 +388,12 @@ class Tracker(SequenceTracker):
         prior = Prior.of(ahead).joined(samples.jumps)
         spread = survival(samples.log_weight)
         samples = self._screen(problem, samples, prior, bounds)
-        samples = self._descend_coarsely(problem, samples, prior, bounds)
+        samples, problem = self._descend_coarsely(problem, samples, prior, bounds)
         started = len(samples.x)
 
         # 2.3: descend from every sample, and discard minima found before.
         search = _Search(
-            problem.children(samples.parent, prior),
+            problem,
             samples,
             self.optimiser.start(samples.x),
             _unperturbed(samples, prior, bounds),
@@ -436,15 +436,15 @@ class Tracker(SequenceTracker):
 
     def _descend_coarsely(
         self, problem: SearchProblem, samples: Samples, prior: Prior, bounds: Bounds
-    ) -> Samples:
-        """Let every so many samples descend on the coarse cost, if the frame has one."""
-        if not self.coarse_every or problem.children(samples.parent, prior).coarse is None:
-            return samples
+    ) -> tuple[Samples, SearchProblem]:
+        """Let every so many samples descend on the coarse cost, if there is one; their problem."""
+        if not self.coarse_every or problem.coarse is None:
+            return samples, problem.children(samples.parent, prior)
         samples, some = self._modes_among(samples, prior, bounds)
-        coarse = problem.children(samples.parent, prior).take(some).coarse
-        assert coarse is not None
-        rough = self.optimiser.ends(coarse, samples.x[some], bounds)
-        return samples._replace(x=samples.x.index_copy(0, some, rough))
+        problem = problem.children(samples.parent, prior)
+        assert problem.coarse is not None
+        rough = self.optimiser.ends(problem.coarse.take(some), samples.x[some], bounds)
+        return samples._replace(x=samples.x.index_copy(0, some, rough)), problem
 
     def _modes_among(self, samples: Samples, prior: Prior, bounds: Bounds) -> tuple[Samples, Items]:
         """Choose the samples that descend on the coarse cost, every mode's own copy among them.
