@@ -112,7 +112,7 @@ class TrustRegionState(NamedTuple):
 
     def take(self, items: Items) -> TrustRegionState:
         """Some of the items, as a copy."""
-        return TrustRegionState.of([field[items] for field in self.tensors])
+        return TrustRegionState.of([field.index_select(0, items) for field in self.tensors])
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
@@ -375,7 +375,7 @@ class TrustRegionNewton:
             if bool(running.all()):
                 continue
             for into, field in zip(result.tensors, pool.tensors, strict=True):
-                into[items] = field
+                into.index_copy_(0, items, field)
             # Waiting items take the places of finished ones; when none waits the pool shrinks.
             places = int((~running).sum())
             items, queue = torch.cat([items[running], queue[:places]]), queue[places:]
