@@ -18,10 +18,13 @@ from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import foreground_weight
-from torchcss.vision.features import FrameFeatures
+from torchcss.vision.features import FrameFeatures, Window
 from torchcss.vision.sampling import gaussian_blur
 
 _T = TypeVar("_T")
+
+Foreground = tuple[Float[Tensor, "layers y x"], Window | None]
+"""See `FrameContext.foreground`."""
 
 _GRAIN = 2.0
 """Pixels over which the belief in the foreground is smoothed before it weighs edges: single pixels
@@ -113,37 +116,41 @@ class FrameContext:
             return None if field is None else torch.cat([field, torch.ones_like(field[:1])])
         found = features.edge_energy * features.edge_direction
         weight = features.edge_weight(boundary_emphasis=self.boundary_emphasis)
-        ratio = self.foreground(background=True) if foreground and features.mask is None else None
-        if ratio is not None:
-            belief = gaussian_blur(0.5 + 0.5 * ratio.amax(0)[None, None], _GRAIN)[0, 0]
+        seen = self.foreground(background=True) if foreground and features.mask is None else None
+        if seen is not None:
+            ratio, window = seen[0].amax(0), seen[1]
+            if window is not None:
+                ratio, part = ratio.new_zeros(weight.shape), ratio
+                ratio[window.pixels] = part
+            belief = gaussian_blur(0.5 + 0.5 * ratio, _GRAIN)
             weight = weight * foreground_weight(belief)
         return torch.cat([found, weight[None]]).to(field)
 
-    def foreground(self, *, background: bool) -> Float[Tensor, "layers h w"] | None:
-        """Foreground log-likelihood ratio of every pixel for each layer of parts, through a tanh.
+    def foreground(self, *, background: bool) -> Foreground | None:
+        """Foreground log-likelihood ratio of pixels for each layer of parts, through a tanh.
 
         Args:
             background: Whether to use what is known of the picture behind the body.
+
+        Returns:
+            The ratios, and the window that they are of: outside it they are zero. None: it is the
+            whole picture.
         """
         return self._before_background if background else self._before_surroundings
 
     @cached_property
-    def _before_surroundings(self) -> Float[Tensor, "layers h w"] | None:
+    def _before_surroundings(self) -> Foreground | None:
         if self.appearance is None or self.features is None or self.features.colour is None:
             return None
+        colour, window = self.features.colour, self.features.window
+        seen = colour if window is None else colour[window.pixels]
         # Single precision is far finer than the colours: these are a picture for each layer.
-        colour, window = self.features.colour.float(), self.features.window
-        if window is None:
-            return self.appearance.foreground_ratio(colour)
-        seen = self.appearance.foreground_ratio(colour[window.pixels])
-        whole = seen.new_zeros(len(seen), *colour.shape[1:])
-        whole[window.pixels] = seen
-        return whole
+        return self.appearance.foreground_ratio(seen.float()), window
 
     @cached_property
-    def _before_background(self) -> Float[Tensor, "layers h w"] | None:
+    def _before_background(self) -> Foreground | None:
         if self.background is None:
             return self._before_surroundings
         if self.appearance is None or self.features is None or self.features.colour is None:
             return None
-        return self.appearance.foreground_ratio(self.features.colour, self.background)
+        return self.appearance.foreground_ratio(self.features.colour, self.background), None

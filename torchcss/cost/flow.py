@@ -30,6 +30,7 @@ the frame before, and `FlowTerm().point_cost(...)`.
 from __future__ import annotations
 
 import math
+from types import EllipsisType
 from typing import NamedTuple
 
 import torch
@@ -87,13 +88,16 @@ def flow_targets(
     check_shape("flow", flow, 2, height, width)
     if flow.ndim != 3:
         raise ShapeError(f"flow: expected one flow [2, {height}, {width}], got {list(flow.shape)}")
-    is_known = flow.abs().amax(dim=0) < _UNKNOWN_FLOW
-    known = trust = is_known.to(flow)
     if outlier is not None:
         check_shape("outlier", outlier, height, width)
-        trust = known * (1 - outlier.to(flow))
     projection = camera.project(nodes.points)
-    channels = torch.cat([torch.where(is_known, flow, 0.0), known[None], trust[None]])
+    # What is not beside a node is not looked at: it stays as it is in memory.
+    channels, box = flow.new_empty(4, height, width), _box(projection.uv, height, width)
+    is_known = flow[box].abs().amax(dim=0) < _UNKNOWN_FLOW
+    known = is_known.to(flow)
+    channels[:2][box] = torch.where(is_known, flow[box], 0.0)
+    channels[2][box] = known
+    channels[3][box] = known if outlier is None else known * (1 - outlier[box].to(flow))
     values, inside = sample_bilinear(channels, projection.uv)
     # The mean of the known pixels alone: the zeros in place of the others say nothing.
     share = values[..., 2:3]
@@ -101,6 +105,16 @@ def flow_targets(
     seen = nodes.exists * (inside & projection.valid)
     weight = values[..., 3].clamp(0, 1) * seen * nodes.visible
     return FlowTargets(projection.uv + moved, weight)
+
+
+def _box(uv: Tensor, height: int, width: int) -> tuple[EllipsisType, slice, slice]:
+    """The index of the pixels of an image that are beside some places, or nearest to them."""
+    within = uv.reshape(-1, 2).clamp(min=0).minimum(uv.new_tensor([width - 1, height - 1]))
+    if not len(within):
+        return (..., slice(0), slice(0))
+    ends = torch.stack([(within.amin(0) - 1).clamp(min=0), within.amax(0) + 3])
+    (left, top), (right, bottom) = ends.int().tolist()
+    return (..., slice(top, bottom), slice(left, right))
 
 
 @frozen

@@ -41,7 +41,6 @@ from torchcss.cost.term import Need, OnPoints, Values
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.types import frozen
 from torchcss.vision.camera import Camera
-from torchcss.vision.features import Window
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
 
@@ -90,19 +89,14 @@ def layer_of_part(body: BodyModel) -> Int[Tensor, " parts"]:
     return torch.tensor(part_layers(body)[1], dtype=torch.long, device=body.tie.device)
 
 
-def region_field(
-    ratio: Float[Tensor, "layers h w"], *, window: Window | None = None
-) -> SplineField:
+def region_field(ratio: Float[Tensor, "layers h w"]) -> SplineField:
     """Make the foreground ratios of a frame, or of a window of it, smooth functions.
 
     Args:
         ratio: How much each pixel looks like each layer, in -1..1.
-        window: The part of the frame that the functions are of, outside of which they are zero;
-            None: all of it.
     """
     # Single precision is far finer than the colours, and twice as fast.
-    seen = (ratio if window is None else ratio[window.pixels]).float()
-    return spline_field(gaussian_blur(seen, _SMOOTHING))
+    return spline_field(gaussian_blur(ratio.float(), _SMOOTHING))
 
 
 class RegionMasks(NamedTuple):
@@ -228,15 +222,14 @@ class RegionTerm(OutlineTerm):
 
     def prepare(self, context: FrameContext) -> OnPoints | None:
         """Make the foreground of a frame smooth; None where no colours are known."""
-        foreground = context.foreground(background=self.background)
-        if foreground is None:
+        seen = context.foreground(background=self.background)
+        if seen is None:
             return None
+        ratio, window = seen
         part = context.tables.of(ContourPredictor).node_part
         layer = context.tables.of(layer_of_part)[part]
-        window = None if context.features is None else context.features.window
         origin = (0, 0) if window is None else (window.left, window.top)
-        field = region_field(foreground, window=window)
-        return self.bind(context, RegionImages(field, layer, origin))
+        return self.bind(context, RegionImages(region_field(ratio), layer, origin))
 
     def match(
         self, nodes: ImageNodes, image: RegionImages, at: Float[Tensor, "k 2"] | None = None

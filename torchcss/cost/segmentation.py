@@ -21,6 +21,7 @@ What to call: `SegmentationTerm.images` once a frame, then `value` at any number
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 from jaxtyping import Float, Int
@@ -34,6 +35,7 @@ from torchcss.cost.region import layer_of_part
 from torchcss.cost.term import BoundWeight, Need, Term
 from torchcss.types import frozen
 from torchcss.vision.camera import Camera
+from torchcss.vision.features import Window
 
 _FEWEST_PIXELS = 20
 """A body of which the reduced image has fewer counts as if it had so many."""
@@ -84,12 +86,12 @@ class SegmentationTerm(Term):
 
     def prepare(self, context: FrameContext) -> BoundWeight | None:
         """Reduce the foreground of a frame; None without colours, or without a pose before it."""
-        foreground = context.foreground(background=self.background)
-        if foreground is None or context.modes is None:
+        seen = context.foreground(background=self.background)
+        if seen is None or context.modes is None:
             return None
-        layer = context.tables.of(layer_of_part)
-        expected = context.modes[0]
-        images = self.images(foreground, layer, context.camera, context.body, expected)
+        ratio, window = seen
+        layer, expected = context.tables.of(layer_of_part), context.modes[0]
+        images = self.images(ratio, layer, context.camera, context.body, expected, window=window)
         return self.bind(images)
 
     def bind(self, images: SegmentationImages) -> BoundWeight:
@@ -103,6 +105,8 @@ class SegmentationTerm(Term):
         camera: Camera,
         body: BodyModel,
         expected: Float[Tensor, " n"],
+        *,
+        window: Window | None = None,
     ) -> SegmentationImages:
         """Prepare a frame.
 
@@ -112,19 +116,15 @@ class SegmentationTerm(Term):
             camera: Camera of the image.
             body: The body on this frame's base.
             expected: A pose near the one sought, whose area is the unit of the term.
+            window: The window that `ratio` is of, which is zero elsewhere; None: all of the image.
         """
-        small = camera.scaled(1 / self.reduction)
-        width, height = small.image_size_wh
-        side = self.reduction
-        if ratio.shape[1:] == (height * side, width * side):  # rows first: three times as fast
-            rows = ratio.unflatten(1, (height, side)).sum(2)
-            reduced = rows.unflatten(2, (width, side)).sum(3) / side**2
-        else:
-            reduced = functional.adaptive_avg_pool2d(ratio[None], (height, width))[0]
-        padded = functional.pad(reduced.to(body.tie), (0, 0, 0, 0, 0, 1))
+        small = _scaled(camera, 1 / self.reduction)
+        window = window or Window(0, 0, *camera.image_size_wh)
+        reduced = _reduced(ratio, window, camera.image_size_wh, small.image_size_wh)
         layer = functional.pad(layer_of_part, (0, 1), value=len(ratio))
         area = int((self._parts(body, expected, small) >= 0).sum())
-        return SegmentationImages(small, padded, layer, float(max(area, _FEWEST_PIXELS)))
+        area = float(max(area, _FEWEST_PIXELS))
+        return SegmentationImages(small, reduced.to(body.tie), layer, area)
 
     def value(
         self, body: BodyModel, x: Float[Tensor, "*batch n"], images: SegmentationImages
@@ -147,3 +147,35 @@ class SegmentationTerm(Term):
 
     def _parts(self, body: BodyModel, x: Tensor, camera: Camera) -> Tensor:
         return part_map(body, x, camera, rings=self.rings, meridians=self.meridians)
+
+
+@lru_cache(maxsize=8)
+def _scaled(camera: Camera, factor: float) -> Camera:
+    """The same camera in every frame: making one takes a millisecond."""
+    return camera.scaled(factor)
+
+
+def _reduced(
+    ratio: Float[Tensor, "layers y x"], window: Window, size: tuple[int, int], to: tuple[int, int]
+) -> Float[Tensor, "layers+1 h w"]:
+    """Means of the blocks of images, and a last image of zeros.
+
+    Args:
+        ratio: What the images are in a window; they are zero elsewhere.
+        window: The window.
+        size: Width and height of the images.
+        to: Width and height when they are reduced.
+    """
+    (width, height), side = to, size[0] // to[0]
+    reduced = ratio.new_zeros(len(ratio) + 1, height, width)
+    if size != (side * width, side * height):
+        whole = ratio.new_zeros(len(ratio), size[1], size[0])
+        whole[window.pixels] = ratio
+        reduced[:-1] = functional.adaptive_avg_pool2d(whole[None], (height, width))[0]
+        return reduced
+    left, top, right, bottom = window
+    blocks = functional.pad(ratio, (left % side, -right % side, top % side, -bottom % side))
+    rows = blocks.unflatten(1, (-1, side)).sum(2)  # rows first: three times as fast
+    part = rows.unflatten(2, (-1, side)).sum(3) / side**2
+    reduced[:-1, top // side :, left // side :][:, : part.shape[1], : part.shape[2]] = part
+    return reduced

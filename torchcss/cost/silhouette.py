@@ -119,10 +119,9 @@ class SilhouetteTerm(Term):
         if features.mask is not None:
             foreground = 2 * features.mask - 1
         elif context.background is not None:
-            foreground = context.foreground(background=True)
-            if foreground is not None:
-                sure = context.background.sure
-                foreground = foreground.amax(0).masked_fill(~sure, torch.nan)
+            seen = context.foreground(background=True)
+            if seen is not None:
+                foreground = seen[0].amax(0).masked_fill(~context.background.sure, torch.nan)
         if foreground is None:
             return None
         parts = part_map(
