@@ -17,6 +17,7 @@ from torchcss.inference.smoothing import (
     Transition,
     Windows,
     best_path,
+    mode_weights,
     refine,
     refine_in_windows,
 )
@@ -63,7 +64,6 @@ def test_path_is_the_best_of_all(t: int, points: bool):
             cost,
             times,
             Transition(velocity=(velocity, 2 * velocity)),
-            likelihood_power=0.5,
         )
         path, least = plain.all_paths(
             mean.numpy(),
@@ -71,7 +71,6 @@ def test_path_is_the_best_of_all(t: int, points: bool):
             cost.numpy(),
             times.numpy(),
             np.array([velocity, 2 * velocity]),
-            0.5,
         )
         assert tuple(found.mode.tolist()) == path
         assert float(found.cost) == pytest.approx(least, rel=1e-9)
@@ -88,15 +87,41 @@ def test_path_leaves_a_mode_that_was_better_for_one_frame():
     assert jump.mode.tolist() == [0, 0, 0, 1, 0, 0, 0]
 
 
-def test_unequal_powers_and_a_constant_offset():
+def test_a_constant_offset_by_frame_changes_nothing():
+    # Costs have no zero.
     mean, cost, times = draw(6, 3, 2), 3 * draw(6, 3, seed=1), uneven_times(6)
-    transition = Transition(velocity=5.0)
-    some = best_path(mean, None, cost, times, transition, likelihood_power=0.3)
-    # Costs have no zero: the path does not depend on an offset by frame.
-    other = best_path(mean, None, cost + draw(6, 1), times, transition, likelihood_power=0.3)
+    transition, moved = Transition(velocity=5.0), cost + draw(6, 1)
+    some, other = (best_path(mean, None, each, times, transition) for each in (cost, moved))
     assert some.mode.tolist() == other.mode.tolist()
-    strong = best_path(mean, None, cost, times, transition, likelihood_power=1e6)
-    assert strong.mode.tolist() == cost.argmin(1).tolist()
+    some, other = (mode_weights(mean, None, each, times, transition) for each in (cost, moved))
+    torch.testing.assert_close(some, other)
+
+
+@pytest.mark.parametrize("t", [1, 2, 5])
+@pytest.mark.parametrize("power", [0.15, 1.0])
+def test_weights_are_sums_over_all_paths(t: int, power: float):
+    k, n = 3, 2
+    mean, cost, spread = draw(t, k, n), 3 * draw(t, k, seed=1), covariances(t, k, n=n)
+    cost[t // 2, 1] = math.inf  # a mode that is missing
+    cost[t // 3] += math.inf if t > 3 else 0.0  # a frame without any
+    times, velocity = uneven_times(t), np.array([4.0, 8.0])
+    found = mode_weights(mean, spread, cost, times, Transition(velocity=(4.0, 8.0)), power=power)
+    arguments = (mean.numpy(), spread.numpy(), cost.numpy(), times.numpy(), velocity)
+    expected = plain.weights_over_paths(*arguments, power=power)
+    np.testing.assert_allclose(found.exp().numpy(), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_weights_forget_what_a_path_adds_up():
+    # One mode is cheaper by a nat in every frame: the best path never leaves it, however small a
+    # share of it is new; the weights do, as far as motions between the modes are possible.
+    mean = torch.tensor([[[0.0], [0.1]]] * 50).double()
+    cost = torch.tensor([[0.0, 1.0]] * 50).double()
+    times, transition = torch.arange(50) / 25, Transition(velocity=2.5)
+    assert best_path(mean, None, cost, times, transition).mode.tolist() == [0] * 50
+    weights = mode_weights(mean, None, cost, times, transition, power=0.15).exp()
+    assert 0.5 < float(weights[25, 0]) < 0.7
+    certain = mode_weights(mean, None, cost, times, transition, power=20.0).exp()
+    assert float(certain[25, 0]) > 0.999
 
 
 def test_differences_of_angles_go_the_short_way():
@@ -158,12 +183,12 @@ def test_bad_paths_are_refused():
         best_path(mean, None, cost[:3], times, transition)
     with pytest.raises(ShapeError, match="NaN"):
         best_path(mean, None, cost * math.nan, times, transition)
-    with pytest.raises(ShapeError, match="finite means"):
+    with pytest.raises(ShapeError, match="expected finite"):
         best_path(mean / 0, None, cost, times, transition)
     with pytest.raises(ConfigurationError, match="times that increase"):
         best_path(mean, None, cost, times.flip(0), transition)
-    with pytest.raises(ConfigurationError, match="likelihood_power"):
-        best_path(mean, None, cost, times, transition, likelihood_power=0.0)
+    with pytest.raises(ConfigurationError, match="power"):
+        mode_weights(mean, None, cost, times, transition, power=0.0)
     with pytest.raises(ConfigurationError, match="velocities alone"):
         best_path(mean, None, cost, times, Transition(acceleration=50.0))
     with pytest.raises(ConfigurationError, match="velocity"):

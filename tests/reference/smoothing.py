@@ -20,7 +20,6 @@ def path_cost(
     cost: np.ndarray,
     times: np.ndarray,
     velocity: np.ndarray,
-    likelihood_power: float,
 ) -> float:
     """Negative log of a path: costs, and the densities of its motions relative to none."""
     n, total = mean.shape[-1], 0.0
@@ -29,7 +28,7 @@ def path_cost(
     spread = [nothing if covariance is None else covariance[t, k] for t, k in enumerate(path)]
     for t, k in enumerate(path):
         if np.isfinite(cost[t]).any():
-            total += likelihood_power * cost[t, k]
+            total += cost[t, k]
         if t >= 1:
             motion = np.diag((velocity * (times[t] - times[t - 1])) ** 2)
             total += surprise(x[t] - x[t - 1], motion, spread[t] + spread[t - 1])
@@ -50,7 +49,7 @@ def all_paths(
     mean: np.ndarray,
     covariance: np.ndarray | None,
     cost: np.ndarray,
-    *arguments: np.ndarray | float,
+    *arguments: np.ndarray,
 ) -> tuple[tuple[int, ...], float]:
     """The best of all paths, each one tried."""
     t, k = cost.shape
@@ -106,3 +105,20 @@ def bounded(
     found = lsq_linear(matrix, right, (lower, upper), method="bvls", tol=1e-14, max_iter=2000)
     assert found.success
     return found.x
+
+
+def weights_over_paths(
+    mean: np.ndarray, covariance: np.ndarray, cost: np.ndarray, *arguments: np.ndarray, power: float
+) -> np.ndarray:
+    """Weights of the modes of every frame: sums over all paths through each."""
+    t, k = cost.shape
+    paths = list(itertools.product(range(k), repeat=t))
+    costs = np.array([path_cost(path, mean, covariance, cost, *arguments) for path in paths])
+    likely = np.exp(-power * (costs - costs.min()))
+    weights = np.array(
+        [
+            [sum(likely[i] for i, path in enumerate(paths) if path[f] == m) for m in range(k)]
+            for f in range(t)
+        ]
+    )
+    return weights / weights.sum(1, keepdims=True)

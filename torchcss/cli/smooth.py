@@ -30,8 +30,8 @@ class Smooth:
     """Folder for smooth.npz and summary.json; by default the run's folder."""
     images: bool = False
     """Fit the trajectory to the images of the run's cameras again; implied by --video."""
-    likelihood_power: float = Smoothing.likelihood_power
-    """Power of each frame's likelihood over that of the motion, when modes are chosen."""
+    likelihood_power: float | None = None
+    """Power of what frames and motions say when modes are weighed; by default that of the track."""
     persistence: float = Smoothing.persistence
     """How many frames say as much, in the covariances, as one that is independent."""
     acceleration_ratio: float | None = None

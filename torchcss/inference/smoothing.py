@@ -3,11 +3,16 @@
 A tracker decides frame by frame; once the sequence is over, later frames may tell which of the
 modes of an earlier one was right, and a motion that is possible tells where in a mode it went.
 
-`best_path` chooses one mode per frame, by dynamic programming (Viterbi 1967) over
+Of a path that takes mode k_t in frame t, the energy is
 
-    sum_t  power * cost_t(k_t)  -  sum_t log N(x_t - x_t-1; 0, Q_t + Sigma_t-1 + Sigma_t)
+    sum_t  cost_t(k_t)  -  sum_t log N(x_t - x_t-1; 0, Q_t + Sigma_t-1 + Sigma_t)
 
-`refine` then moves the states of the path together, to the least of
+`best_path` finds the path of least energy, by dynamic programming (Viterbi 1967). `mode_weights`
+sums `exp(-power * energy)` over all paths through a mode, by the forward-backward algorithm (Baum
+et al. 1970): how probable the mode is when all frames are known. What the frames do not show, the
+best path decides by small differences of many frames; the sum over paths does not.
+
+`refine` then moves states of all frames together, to the least of
 
     sum_t  f_t(x_t)  +  1/2 sum_t |(x_t - x_t-1) / (v d_t)|^2
                      +  1/2 sum_t |(x_t - x_t-1 - (d_t / d_t-1) (x_t-1 - x_t-2)) / (a e_t)|^2
@@ -139,7 +144,6 @@ def best_path(
     times: Float[Tensor, " t"],
     transition: Transition,
     *,
-    likelihood_power: float = 1.0,
     changes: Changes | None = None,
     period: Vector | None = None,
 ) -> Path:
@@ -152,7 +156,6 @@ def best_path(
             A frame without any is passed over: all its modes cost the same.
         times: Seconds, increasing; gaps make steps longer.
         transition: What velocities are to be expected; accelerations are for `refine`.
-        likelihood_power: Factor on the costs.
         changes: Where coordinates change, see the module's page.
         period: Period of each parameter, infinite for most: differences are taken the short way.
 
@@ -161,12 +164,67 @@ def best_path(
 
     Raises:
         ShapeError: If the shapes do not agree, or a mode of finite cost is not finite.
-        ConfigurationError: If the times do not increase, the likelihood power is not positive, or
-            the transition judges accelerations.
+        ConfigurationError: If the times do not increase, or the transition judges accelerations.
     """
+    return _viterbi(*_energies(mean, covariance, cost, times, transition, changes, period))
+
+
+def mode_weights(
+    mean: Float[Tensor, "t k n"],
+    covariance: Float[Tensor, "t k n n"] | None,
+    cost: Float[Tensor, "t k"],
+    times: Float[Tensor, " t"],
+    transition: Transition,
+    *,
+    power: float = 1.0,
+    changes: Changes | None = None,
+    period: Vector | None = None,
+) -> Float[Tensor, "t k"]:
+    """How probable each mode of every frame is, all frames considered.
+
+    Args:
+        mean: As `best_path`, like all that follow but for the power.
+        covariance: Their covariances.
+        cost: Negative logarithm of each mode's likelihood.
+        times: Seconds, increasing.
+        transition: What velocities are to be expected.
+        power: Power of the energy of a path, in (0, 1] as a rule: how much of what frames and
+            motions say is new in each of them.
+        changes: Where coordinates change.
+        period: Period of each parameter.
+
+    Returns:
+        Logarithms of the weights, which sum to one in every frame; `-inf`: no such mode.
+
+    Raises:
+        ShapeError: As `best_path`.
+        ConfigurationError: As `best_path`, or if the power is not positive.
+    """
+    if not power > 0:
+        raise ConfigurationError(f"mode_weights: expected a positive power, got {power}")
+    node, edges = _energies(mean, covariance, cost, times, transition, changes, period)
+    own, steps = -power * node, [-power * edge for edge in edges]
+    before, after = [own[0]], [torch.zeros_like(own[-1])]
+    for step, here in zip(steps, own[1:], strict=True):
+        before.append((before[-1][:, None] + step).logsumexp(0) + here)
+    for step, there in zip(reversed(steps), reversed(list(own[1:])), strict=True):
+        after.append((step + there + after[-1]).logsumexp(1))
+    return (torch.stack(before) + torch.stack(after[::-1])).log_softmax(1).to(mean)
+
+
+def _energies(
+    mean: Tensor,
+    covariance: Tensor | None,
+    cost: Tensor,
+    times: Tensor,
+    transition: Transition,
+    changes: Changes | None,
+    period: Vector | None,
+) -> tuple[Float[Tensor, "t k"], list[Float[Tensor, "k k"]]]:
+    """What each mode costs a path, and each step from a mode to one of the next frame."""
     if transition.judges_acceleration:
-        raise ConfigurationError("best_path: it judges velocities alone; leave accelerations out")
-    state, spread, node = _checked_modes(mean, covariance, cost, likelihood_power)
+        raise ConfigurationError("transition: it judges velocities alone; leave accelerations out")
+    state, spread, node = _checked_modes(mean, covariance, cost)
     motion, _ = transition.deviations(_checked_times(times, len(state)), state.shape[-1])
     edges = []
     for step, deviation in enumerate(motion):
@@ -176,11 +234,11 @@ def best_path(
         if spread is not None and wide is not None:
             wide = wide[:, None] + spread[step + 1][None]
         edges.append(_gaussian_cost(apart, deviation, wide))
-    return _viterbi(node, edges)
+    return node, edges
 
 
 def _checked_modes(
-    mean: Tensor, covariance: Tensor | None, cost: Tensor, power: float
+    mean: Tensor, covariance: Tensor | None, cost: Tensor
 ) -> tuple[Float[Tensor, "t k n"], Float[Tensor, "t k n n"] | None, Float[Tensor, "t k"]]:
     """Means, covariances and what each mode costs the path, in float64."""
     check_shape("mean", mean, None, None, None)
@@ -188,16 +246,14 @@ def _checked_modes(
     check_shape("cost", cost, t, k)
     if covariance is not None:
         check_shape("covariance", covariance, t, k, n, n)
-    if not power > 0:
-        raise ConfigurationError(f"best_path: expected a positive likelihood_power, got {power}")
     if bool(cost.isnan().any()):
-        raise ShapeError("best_path: costs hold NaN; expected numbers, inf for a missing mode")
+        raise ShapeError("cost: holds NaN; expected numbers, inf for a missing mode")
     present, finite = cost.isfinite(), mean.isfinite().all(-1)
     if covariance is not None:
         finite = finite & covariance.isfinite().flatten(-2).all(-1)
     if not bool(finite[present].all()):
-        raise ShapeError("best_path: expected finite means and covariances of the modes")
-    node = torch.where(present.any(1, keepdim=True), power * cost.double(), 0.0)
+        raise ShapeError("mean, covariance: expected finite numbers of the modes")
+    node = torch.where(present.any(1, keepdim=True), cost.double(), 0.0)
     return mean.double(), None if covariance is None else covariance.double(), node
 
 

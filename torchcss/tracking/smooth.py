@@ -1,9 +1,10 @@
 """Smooth a track after the fact: one trajectory that explains all frames, with its covariances.
 
 A track holds, for every frame, the modes that the frame and those before it leave possible.
-`smooth_modes` chooses among them with all frames in view (`inference.smoothing.best_path`), takes
-each chosen mode as what its frame says, and moves the states together to where that and the motion
-prior agree, within the joint limits (`inference.smoothing.refine`). It needs nothing but the modes.
+`smooth_modes` weighs them with all frames in view (`inference.smoothing.mode_weights`), by the
+power that the tracker weighed them with, takes the most probable mode of each frame as what it
+says, and moves the states together to where that and the motion prior agree, within the joint
+limits (`inference.smoothing.refine`). It needs nothing but the modes.
 With a lag no frame is told by more than so many after it, as one that waits for them would see it.
 
 The motion prior is the body's `motion_rate` for velocities, and `Smoothing.acceleration_ratio`
@@ -29,7 +30,7 @@ from torchcss.inference.smoothing import (
     Refined,
     Refinement,
     Transition,
-    best_path,
+    mode_weights,
     refine,
 )
 from torchcss.types import Trajectory, Vector, frozen
@@ -42,9 +43,8 @@ class Smoothing:
     """How to smooth.
 
     Attributes:
-        likelihood_power: Power of each frame's likelihood over that of the motion between frames,
-            when modes are chosen. One: both count alike, as in `Tracker.surprise`; what model and
-            motion lack persists over frames.
+        likelihood_power: Power of what frames and motions say when modes are weighed; None: that of
+            the likelihood in the track.
         acceleration_ratio: Expected accelerations over expected velocities, 1/s; lower is smoother.
             For the modes of a tracker 10 is good, for images 20.
         persistence: How many frames say as much, in the covariances, as one that is independent.
@@ -53,7 +53,7 @@ class Smoothing:
         lag: How many frames after each may say something of it; None: all.
     """
 
-    likelihood_power: float = 1.0
+    likelihood_power: float | None = None
     acceleration_ratio: float = 10.0
     persistence: float = 20.0
     lag: int | None = None
@@ -166,21 +166,21 @@ def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
     # Where a frame said nothing, its modes are the prior of the tracker; only those exist.
     node = torch.where(seen[:, None], cost, torch.where(absent, math.inf, 0.0))
     changes, period = base_changes(body, track.bases), _periods(body)
-    path = best_path(
+    weights = mode_weights(
         track.state,
-        # Between frames the modes count as they are; `choice.likelihood_power` tempers their costs.
+        # The power counts for the energy as a whole: in it the modes are as narrow as full costs.
         track.likelihood_power * track.covariance,
         node,
         track.times,
         Transition(velocity=tuple(body.motion_rate.tolist())),
-        likelihood_power=choice.likelihood_power,
+        power=choice.likelihood_power or track.likelihood_power,
         changes=changes,
         period=period,
     )
-    everywhere = torch.arange(len(track.times))
-    chosen = _unwrapped(track.state[everywhere, path.mode], changes, period)
+    mode, everywhere = weights.argmax(1), torch.arange(len(track.times))
+    chosen = _unwrapped(track.state[everywhere, mode], changes, period)
     refined = refine(
-        GaussianEvidence.of_modes(chosen, track.covariance[everywhere, path.mode], seen=seen),
+        GaussianEvidence.of_modes(chosen, track.covariance[everywhere, mode], seen=seen),
         chosen,
         track.times,
         motion_prior(body, choice),
@@ -189,8 +189,8 @@ def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         changes=changes,
     )
     # The modes' covariances have the track's power, their costs are full nats.
-    cost = cost[everywhere, path.mode] + refined.cost / track.likelihood_power
-    return Smoothed(refined, cost, path.mode, seen)
+    cost = cost[everywhere, mode] + refined.cost / track.likelihood_power
+    return Smoothed(refined, cost, mode, seen)
 
 
 def motion_prior(body: BodyModel, choice: Smoothing) -> Transition:
