@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.default_shape import bone_parts, rest_poses, solid_shape, touching_parts
+from torchcss.body.files.mesh import mesh_points
 from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
@@ -569,21 +571,25 @@ def test_bad_requests(tmp_path: Path) -> None:
     assert load_body(path).num_parameters == 11  # XML says its encoding itself
 
 
-@pytest.mark.parametrize("end", [None, b"", b"\n"])
+@pytest.mark.parametrize("end", [None, b"", b"\n", b"obj"])
 def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, end: bytes | None) -> None:
+    name = "a.obj" if end == b"obj" else "a.stl"
     corners = np.array([[[-50, -30, 0], [50, 30, 0], [0, 0, 400]]], "<f4")
-    if end is not None:  # binary
+    if end == b"obj":
+        rows = "".join(f"v {x} {y:e} {z}\n" for x, y, z in corners[0])
+        content = f"# made by a program\n{rows}vn 0 0 1\nf 1//1 2//1 3//1\n".encode()
+    elif end is not None:  # binary
         record = np.concatenate([np.zeros((1, 1, 3), "<f4"), corners], 1).tobytes() + bytes(2)
         content = b"solid in millimetres".ljust(80) + (1).to_bytes(4, "little") + record + end
     else:
         rows = "".join(f"vertex {x} {y:e} {z}\n" for x, y, z in corners[0])
         content = f"solid a\nfacet normal 0 0 1\nouter loop\n{rows}endloop\nendfacet\n".encode()
     (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes" / "a.stl").write_bytes(content)
+    (tmp_path / "meshes" / name).write_bytes(content)
     path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
     mesh = (
         '<visual><origin xyz="0.2 0 0" rpy="0 1.5707963267948966 0"/><geometry>'
-        '<mesh filename="package://arm/meshes/a.stl" scale="0.001 0.001 0.001"/>'
+        f'<mesh filename="package://arm/meshes/{name}" scale="0.001 0.001 0.001"/>'
         "</geometry></visual>"
     )
     text = path.read_text().replace('<link name="link2"/>', f'<link name="link2">{mesh}</link>')
@@ -598,7 +604,7 @@ def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, end: byte
 
 def test_meshes_that_stand_for_a_link_are_told(tmp_path: Path) -> None:
     path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
-    mesh = '<visual><geometry><mesh filename="package://arm/meshes/{}.stl"/></geometry></visual>'
+    mesh = '<visual><geometry><mesh filename="package://arm/meshes/a.dae"/></geometry></visual>'
     ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
     text = path.read_text()
     for link, inside in (("link1", mesh + ball), ("link2", mesh), ("tip", "")):
@@ -607,4 +613,30 @@ def test_meshes_that_stand_for_a_link_are_told(tmp_path: Path) -> None:
     notes = load_body(path).notes
     assert notes[0] == "arm.urdf: limits, axes and solids: as the URDF says"
     assert len(notes) == 2
-    assert notes[1].startswith("arm.urdf: meshes are not opened, link2: ")
+    assert notes[1].startswith("arm.urdf: meshes are not opened, link2 ('a.dae'): ")
+
+
+def test_a_mesh_of_many_links_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[Path] = []
+
+    def points(path: Path) -> np.ndarray:
+        read.append(path)
+        return mesh_points(path)
+
+    monkeypatch.setattr("torchcss.body.files.urdf.mesh_points", points)
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 2 3\n")
+    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
+    mesh = '<visual><geometry><mesh filename="a.obj"/></geometry></visual>'
+    path.write_text(re.sub(r'(<link name="link[12]")/>', rf"\1>{mesh}</link>", path.read_text()))
+    assert {"link1", "link2"} <= {*load_body(path).part_names}
+    assert len(read) == 1
+
+
+@pytest.mark.parametrize(
+    "text", ["<xacro:arm/>", '<link name="${prefix}a"/>', '<link name="a"/><xacro:if value="1"/>']
+)
+def test_xacro_is_told_apart(tmp_path: Path, text: str) -> None:
+    for name in ("a.urdf", "a.urdf.xacro"):
+        (tmp_path / name).write_text(f"<robot>{text}</robot>")
+        with pytest.raises(BodyError, match=f"{name}: a xacro file, .* expand it"):
+            load_body(tmp_path / name)

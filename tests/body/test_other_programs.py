@@ -107,6 +107,7 @@ def test_equality_of_joints(tmp_path: Path, coefficients: str) -> None:
     assert body.state_names == ("left",)
     joints = body.tie @ torch.tensor([0.3], dtype=torch.float64) + body.offset
     np.testing.assert_allclose(joints, [0.3, offset + 0.3 * factor])
+    assert "a.xml: equalities of other things than joints are left out: connect" in body.notes
     path.write_text(path.read_text().replace("0 0 0'/><connect", "5 0 0'/><connect"))
     body = load_body(path)
     assert body.state_names == ("left", "right")

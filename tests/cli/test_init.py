@@ -107,7 +107,7 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
     assert cli.main([*given, "--body", "arm8"]) == 0
     assert len(load_track(tmp_path).frames) == 2
     capsys.readouterr()
-    assert cli.main([*given, "--body", "arm7"]) == 2
+    assert cli.main([*given, "--body", "arm7", "--overwrite"]) == 2
     assert "the fitted body is arm8" in capsys.readouterr().err
 
 

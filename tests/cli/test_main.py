@@ -27,7 +27,12 @@ def spoil_keypoints(files: Path, **changes) -> None:
 def test_good_files_track(files: Path, capsys: pytest.CaptureFixture[str]):
     assert track(files) == 0
     assert "3 frames" in capsys.readouterr().out
-    assert (files / "out" / "track.npz").exists()
+    made = (files / "out" / "track.npz").read_bytes()
+    assert track(files) == 2
+    assert "holds a run: --resume" in capsys.readouterr().err
+    assert (files / "out" / "track.npz").read_bytes() == made
+    assert track(files, "--resume", "--no-overlay") == 0
+    assert track(files, "--overwrite", "--no-overlay") == 0
 
 
 def test_for_programs_and_in_silence(files: Path, capfd: pytest.CaptureFixture[str]):
@@ -40,10 +45,10 @@ def test_for_programs_and_in_silence(files: Path, capfd: pytest.CaptureFixture[s
     assert all(Path(path).is_file() for path in found["files"].values())
     steps = ("finding the first pose", "tracking", "drawing overlay and report")
     assert sorted(steps, key=told.err.index) == list(steps)
-    assert track(files, "--quiet", "--no-overlay") == 0
+    assert track(files, "--quiet", "--no-overlay", "--overwrite") == 0
     assert capfd.readouterr() == ("", "")
     (files / "video.mp4").unlink()
-    assert track(files, "--quiet", "--json") == 2
+    assert track(files, "--quiet", "--json", "--overwrite") == 2
     told = capfd.readouterr()
     assert (told.out, told.err.count("\n")) == ("", 1)
 

@@ -50,7 +50,7 @@ from torchcss.files import one_line
 from torchcss.joint_names import skeleton_joint_names
 from torchcss.types import frozen
 
-BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh")
+BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh", ".xacro")
 
 _AS_IT_IS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _BVH_Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))

@@ -12,7 +12,8 @@ import tyro
 from torchcss.app.smooth import report, smooth
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.cli.options import PathArgument, SettingsOptions, Terminal, TerminalOptions
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, OutputError
+from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.settings import Settings
 from torchcss.types import frozen
@@ -33,6 +34,8 @@ class Track:
     clicked; of an archive of several recordings FILE.npz#SUBJECT/ACTION/CAMERA."""
     out: Path = Path("out/track")
     """Output folder."""
+    overwrite: bool = False
+    """Replace the run that the folder holds."""
     start: int = 0
     """First frame."""
     stop: int | None = None
@@ -65,6 +68,11 @@ class Track:
     def run(self) -> None:
         """Run the verb."""
         others = self.others()
+        if (self.out / TRACK_NAME).is_file() and not (self.overwrite or self.options.resume):
+            raise OutputError(
+                f"{self.out}: holds a run: --resume goes on with it where it was interrupted, "
+                "--overwrite replaces it, --out names another folder"
+            )
         live, save, connect = None, self.live_save, self.live_connect
         if self.live or connect is not None or save is not None:
             from torchcss.app.live import LiveViewer

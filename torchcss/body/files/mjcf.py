@@ -71,13 +71,15 @@ def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
             expands to very many bodies.
         MissingExtraError: If MuJoCo is not installed.
     """
-    model, meshed = _compiled(path)
+    model, meshed, left_out = _compiled(path)
     if not model.njnt and model.nbody < 2:
         raise BodyError(f"{path}: no <body> in the <worldbody>; expected an MJCF of a body")
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     joints = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
     chosen = max(tops, key=lambda body: joints[body])
     notes = ["limits, axes and solids: as the MJCF says"]
+    if left_out:
+        notes.append(f"equalities of other things than joints are left out: {', '.join(left_out)}")
     if len(tops) > 1:
         others = [model.body(body).name or "without name" for body in tops if body != chosen]
         notes.append(f"of several bodies the one with most joints; not {', '.join(others)}")
@@ -95,6 +97,7 @@ class _Screen:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.num_files = 0
+        self.left_out: list[str] = []
         self.attached: dict[str, ElementTree.Element] = {}
         self.sizes: dict[ElementTree.Element, float] = {}
 
@@ -118,6 +121,8 @@ class _Screen:
         for child in element:
             if child.tag == "include":
                 children += self.read(child.get("file", ""))
+            elif element.tag == "equality" and child.tag != "joint":
+                self.left_out.append(child.tag)
             elif child.tag in _KEPT:
                 child.attrib.pop("material", None)
                 if child.tag == "flexcomp":
@@ -169,8 +174,8 @@ def _product(words: str) -> float:
         return 1  # the compiler says what is wrong
 
 
-def _compiled(path: Path) -> tuple[Any, list[str]]:
-    """The file as MuJoCo compiles it, meshes left out, and the bodies that have some."""
+def _compiled(path: Path) -> tuple[Any, list[str], list[str]]:
+    """The file as MuJoCo compiles it, the bodies whose meshes are left out, other equalities."""
     mujoco = optional_package(
         "mujoco",
         f"{path}: an MJCF file is read by MuJoCo; install it: pip install 'torchcss[mjcf]'",
@@ -197,7 +202,7 @@ def _compiled(path: Path) -> tuple[Any, list[str]]:
                     )
             spec.compiler.fusestatic = spec.compiler.discardvisual = False
             spec.compiler.boundmass = spec.compiler.boundinertia = _LIGHT
-            return spec.compile(), list(meshed)
+            return spec.compile(), list(meshed), screen.left_out
     except (ValueError, mujoco.FatalError) as error:
         reason = re.sub(r",? line \d+", "", one_line(error))  # of what was handed over
         raise BodyError(f"{path}: MuJoCo cannot read this MJCF: {reason}") from error

@@ -13,10 +13,12 @@ Call `read_urdf`; `torchcss.load_body("x.urdf")` does.
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from itertools import count
 from pathlib import Path
 
@@ -27,7 +29,7 @@ from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order
 from torchcss.body.files.bvh import HungTree
 from torchcss.body.files.default_shape import solid_shape, unopened_meshes
-from torchcss.body.files.stl import stl_points
+from torchcss.body.files.mesh import MESH_SUFFIXES, mesh_points
 from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows, as_vector
 from torchcss.errors import BodyError
 from torchcss.files import shortened
@@ -40,6 +42,9 @@ _SIZES = {
     "capsule": ("radius", "length"),
 }
 
+
+PointsOf = Callable[[Path], Float[np.ndarray, "8 3"]]
+"""Reads a mesh."""
 
 _THINNEST = 0.001
 """Half the thickness of the thinnest part, metres."""
@@ -65,6 +70,9 @@ def read_urdf(
         BodyError: If it is no URDF, has joints of more than one degree of freedom, repeats a name,
             is not one tree, or has a number that is none.
     """
+    words = [word for each in robot.iter() for word in (each.tag, *each.attrib.values())]
+    if any(word.startswith("xacro:") or "${" in word for word in words):
+        raise BodyError("a xacro file, which makes a URDF: expand it, xacro THIS > ROBOT.urdf")
     if robot.tag != "robot" or robot.find("link") is None:
         raise BodyError(f"not a URDF, expected <robot> with links, found <{robot.tag}>")
     notes = ["limits, axes and solids: as the URDF says"]
@@ -237,15 +245,18 @@ def _boxes_of_meshes(
     """A part for every link that has no solids but meshes."""
     parts: list[PartSpecification] = []
     unopened: list[str] = []
+    points_of = cache(mesh_points)  # legs and fingers often share one
     for link in robot.findall("link"):
         name = link.get("name", "")
         if name in shaped or link.find("*/geometry/mesh") is None:
             continue
-        corners = _mesh_points(link, "visual", folder, notes)
+        corners = _mesh_points(link, "visual", folder, notes, points_of)
         if corners is None:
-            corners = _mesh_points(link, "collision", folder, notes)
+            corners = _mesh_points(link, "collision", folder, notes, points_of)
         if corners is None:
-            unopened.append(name)
+            mesh = link.find("*/geometry/mesh[@filename]")
+            file = "" if mesh is None else re.split(r"[/\\]", mesh.get("filename", ""))[-1]
+            unopened.append(f"{name} ({shortened(file)})")
             continue
         low, high = corners.min(0), corners.max(0)
         half = np.maximum(0.5 * (high - low), _THINNEST)
@@ -265,12 +276,12 @@ def _boxes_of_meshes(
         names = shortened(", ".join(part.name for part in parts))
         notes.append(f"as large as the boxes around their meshes: {names}")
     if unopened:
-        notes.append(unopened_meshes(unopened, "<collision>, or STL files in this folder,"))
+        notes.append(unopened_meshes(unopened, "<collision>, or STL or OBJ files in this folder,"))
     return tuple(parts)
 
 
 def _mesh_points(
-    link: ElementTree.Element, tag: str, folder: Path, notes: list[str]
+    link: ElementTree.Element, tag: str, folder: Path, notes: list[str], points_of: PointsOf
 ) -> Float[np.ndarray, "p 3"] | None:
     """Corners of all meshes of a link in its frame; None: there are none, or one is not at hand."""
     found: list[np.ndarray] = []
@@ -283,7 +294,7 @@ def _mesh_points(
             scale = _numbers(where, "scale", mesh.get("scale", "1 1 1"), 3)
             place, turn = _origin(where, element)
             try:
-                corners = stl_points(path)
+                corners = points_of(path)
             except BodyError as error:  # such as a pointer to where the file lies
                 notes.append(str(error))
                 return None
@@ -292,12 +303,16 @@ def _mesh_points(
 
 
 def _inside(folder: Path, name: str) -> Path | None:
-    """The STL of that name in a folder or below it; a package is the folder, or is in it."""
+    """The mesh of that name in a folder or below it; a package is the folder, or is in it."""
     package, _, rest = name.removeprefix("file://").removeprefix("package://").partition("/")
     for each in (f"{package}/{rest}", rest if name.startswith("package://") else ""):
         with suppress(OSError, ValueError):
             path = (folder / each).resolve()
-            if path.suffix.lower() == ".stl" and path.is_relative_to(folder) and path.is_file():
+            if (
+                path.suffix.lower() in MESH_SUFFIXES
+                and path.is_relative_to(folder)
+                and path.is_file()
+            ):
                 return path
     return None
 
