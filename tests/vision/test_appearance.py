@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchcss.kernels import compiler
 from torchcss.vision.appearance import BINS, Appearance, colour_bins
 
 RED, GREEN, GREY = (0.9, 0.1, 0.1), (0.1, 0.8, 0.2), (0.5, 0.5, 0.5)
@@ -65,6 +66,16 @@ def test_old_colours_are_forgotten_by_degrees_and_too_few_pixels_teach_nothing()
     same = known.learn(blue, few[None], few[None])
     torch.testing.assert_close(same.inside, known.inside)
     torch.testing.assert_close(same.outside, known.outside)
+
+
+def test_compiled_counts_are_those_of_their_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, _ = picture()
+    masks = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0)) > 0.6
+    known = [Appearance.unknown(3, like=image).learn(image, masks, ~masks)]
+    monkeypatch.setattr(compiler, "COMPILED", False)
+    known.append(Appearance.unknown(3, like=image).learn(image, masks, ~masks))
+    for one, other in zip(*known, strict=True):
+        assert torch.equal(one, other)
 
 
 def test_the_whole_range_of_colours_has_bins() -> None:

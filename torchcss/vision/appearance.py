@@ -25,7 +25,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchcss.kernels.checked import run
 from torchcss.vision.background import Background
+from torchcss.vision.sampling import has_kernels
 
 Histograms = Float[Tensor, "layers bins"]
 
@@ -129,11 +131,22 @@ def colour_bins(colour: Float[Tensor, "3 h w"]) -> Int[Tensor, "h w"]:
 
 
 def _mix(old: Histograms, bins: Tensor, masks: Tensor, rate: float) -> Histograms:
-    counts = torch.stack([torch.bincount(bins[mask], minlength=BINS**3) for mask in masks])
+    counts = _counts(bins, masks)
     number = counts.sum(-1, keepdim=True)
     new = counts.to(old) / number
     mixed = torch.where(old.sum(-1, keepdim=True) > 0, old.lerp(new, rate), new)
     return torch.where(number >= _FEWEST, mixed, old)
+
+
+def _counts(bins: Int[Tensor, "h w"], masks: Bool[Tensor, "layers h w"]) -> Tensor:
+    """Pixels of each mask in each bin."""
+    if has_kernels(masks):
+        from torchcss.vision.appearance_kernels import count_bins
+
+        counts = torch.zeros(len(masks), BINS**3, dtype=torch.long)
+        run(count_bins, bins.contiguous(), masks.contiguous(), counts)
+        return counts
+    return torch.stack([torch.bincount(bins[mask], minlength=BINS**3) for mask in masks])
 
 
 def _smooth(histograms: Histograms) -> Histograms:
