@@ -99,6 +99,16 @@ class FrameContext:
         """What `expecting` has made last; what is packed of it is kept with it."""
         return []
 
+    def of(self, find: Callable[[FrameContext], _T]) -> _T:
+        """What a function finds in this frame, found once for all that ask."""
+        if find not in self._found:
+            self._found[find] = find(self)
+        return self._found[find]
+
+    @cached_property
+    def _found(self) -> dict[Any, Any]:
+        return {}
+
     @property
     def is_out(self) -> bool:
         """Whether there is no picture."""

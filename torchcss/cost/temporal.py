@@ -107,8 +107,14 @@ class MixturePrior(Term):
         """Bind the prior to the modes before; None without them."""
         if context.prior is None:
             return None
-        density = self.density(context.prior)
-        return OnStates(lambda posed, _: self.local_model(posed.x, density))
+        return OnStates(
+            lambda posed, _: self.local_model(posed.x, posed.context.of(self.density_in))
+        )
+
+    def density_in(self, context: FrameContext) -> MixtureDensity:
+        """The prior of a frame that has modes before."""
+        assert context.prior is not None
+        return self.density(context.prior)
 
     def density(self, predicted: GaussianMixture) -> MixtureDensity:
         """Prepare the prior of a frame.

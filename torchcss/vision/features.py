@@ -315,8 +315,8 @@ class FeatureExtractor(nn.Module):
         new_width, new_height = self.working_shape(width, height)
         size = None if (new_width, new_height) == (width, height) else (new_height, new_width)
         if picture.dtype in _WHITE:
-            small = _shrunk(planes, size)
-            return (small.to(self.luma) / _WHITE[picture.dtype]).clamp(0.0, 1.0)
+            small = _shrunk(planes, size).to(self.luma)
+            return small.div_(_WHITE[picture.dtype]).clamp_(0.0, 1.0)
         planes = planes.to(self.luma).contiguous()
         least, greatest = (float(bound) for bound in planes.aminmax())
         if not (least >= -1.0e-3 and greatest <= 1.0 + 1.0e-3):

@@ -256,7 +256,7 @@ class FusedEngine:
         return self._priors.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
 
     def _pack_prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
-        priors, others, repulsion, limbs = [], set(), [], []
+        priors, others, states, repulsion, limbs = [], set(), [], [], []
         for term in cost.choice.terms:
             if term.kind != "prior" or cost.bound[term, past] is None:
                 continue
@@ -270,10 +270,11 @@ class FusedEngine:
                 limbs = self._pack_limbs(weight, past)
             else:
                 others.add(term.name)
-        records = pack.pack_priors(priors, past)
-        workspaces = Workspaces(partial(pack.make_prior_scratch, records[-1]))
-        states = _Packed(add_priors, records[0].centre.shape[1], records, workspaces)
-        return [states, *repulsion, *limbs], frozenset(others)
+        if priors:
+            records = pack.pack_priors(priors, past)
+            workspaces = Workspaces(partial(pack.make_prior_scratch, records[-1]))
+            states = [_Packed(add_priors, records[0].centre.shape[1], records, workspaces)]
+        return [*states, *repulsion, *limbs], frozenset(others)
 
     def _pack_limbs(self, weight: float, past: FrameContext) -> list[_Packed]:
         density = past.tables.of(density_where(past.camera.up))

@@ -458,8 +458,7 @@ def pack_priors(
             precision = term.local_model(mean, body).hessian[columns][:, columns]
             gaussian = Gaussian(np.array(columns), array(mean[columns]), weight * array(precision))
         elif isinstance(term, MixturePrior):
-            assert context.prior is not None
-            density = term.density(context.prior)
+            density = context.of(term.density_in)
             most = float(density.precision.amax())
             far = 1e-4 * (torch.finfo(body.dtype).max / most) ** 0.5
             fields = (array(field) for field in density)
