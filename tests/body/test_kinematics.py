@@ -126,7 +126,7 @@ def test_twists_move_points_as_autograd_says(
         return ((turn @ offset[..., None])[..., 0] + origin) @ base.T + shift
 
     jacobian = torch.autograd.functional.jacobian(points, q)
-    pose = tree(q, base, shift)
+    pose = tree(q, torch.cat([base, shift[:, None]], dim=1))
     p = points(q)
     arm = torch.linalg.cross(pose.omega[:, None, :].expand(-1, len(p), -1), p.expand(len(q), -1, 3))
     velocity = (arm + pose.velocity[:, None, :]) * tree.ancestors[..., None]
@@ -171,11 +171,11 @@ def test_one_compiled_call_is_the_same(
     """Tensors that want a derivative take the other way, and so do those of `torch.func`."""
     tree = (awkward_tree() if name == "awkward" else load_body(name).tree).to(dtype)
     turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([0.3, 1.0, -2.0]).double()))
-    base = turn.to(dtype), torch.tensor([1.0, 2.0, 3.0], dtype=dtype)
+    base = torch.cat([turn, torch.tensor([[1.0], [2.0], [3.0]])], dim=1).to(dtype)
     for batch in ((), (0,), (1,), (3, 2)):
         q = torch.randn(*batch, tree.num_joints, generator=generator, dtype=torch.float64)
         q = q.to(dtype)
-        compiled, plain = tree(q, *base), tree(q.clone().requires_grad_(), *base)
+        compiled, plain = tree(q, base), tree(q.clone().requires_grad_(), base)
         assert plain.rotation.requires_grad
         for one, other in zip(compiled, plain, strict=True):
             torch.testing.assert_close(
@@ -226,8 +226,6 @@ def test_wrong_states_are_refused() -> None:
     tree = awkward_tree()
     with pytest.raises(ShapeError, match="expected a shape"):
         tree(torch.zeros(3, dtype=torch.float64))
-    with pytest.raises(ShapeError, match=r"float32.*float64.*convert"):
-        tree(torch.zeros(tree.num_joints, dtype=torch.float32))
     with pytest.raises(BodyError, match="no link 'nose'"):
         tree.link_index("nose")
 

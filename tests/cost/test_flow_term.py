@@ -15,7 +15,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.surface import implicit
 from torchcss.cost.flow import FlowTargets, FlowTerm, flow_targets
 from torchcss.cost.interior import InteriorNodes
-from torchcss.cost.visibility import SeenNodes, front_facing
+from torchcss.cost.visibility import SeenNodes, facing_nodes
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian
 from torchcss.studies.render.sequences import arm_sequence
@@ -74,10 +74,8 @@ def random_targets(*batch: int, generator: torch.Generator, count: int = 24) -> 
 
 def seen(points: Tensor, normals: Tensor, visible: Tensor | None, camera: Camera) -> SeenNodes:
     """Nodes that face the camera or not, of which all are visible or some."""
-    facing = front_facing(points, normals, camera.centre_world)
-    return SeenNodes(
-        points, normals, facing, torch.ones_like(facing) if visible is None else visible
-    )
+    nodes = facing_nodes(points, normals, camera.centre_world)
+    return nodes if visible is None else nodes._replace(visible=visible)
 
 
 @pytest.mark.parametrize("name", ["arm7", "body34"])

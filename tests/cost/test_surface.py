@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
-from torchcss.cost.visibility import facing_nodes, front_facing
+from torchcss.cost.visibility import facing_nodes
 from torchcss.robust import Leclerc
 from torchcss.vision.camera import Camera
 from torchcss.vision.spline import SplineField, spline_field
@@ -51,13 +51,12 @@ def test_value_is_the_docstring(generator: torch.Generator) -> None:
     (points, normals), targets = some_nodes(generator), some_targets(generator)
     nodes = facing_nodes(points, normals, camera.centre_world)
     value = term.value(nodes, camera, field, targets)
-    facing = front_facing(points, normals, camera.centre_world)
     for item in range(2):
         for node in range(points.shape[1]):
             uv = camera.project(points[item, node][None]).uv
             residual = float(field.value(uv)) - float(targets.level[item, node])
             rho = 1 - math.exp(-((residual / 0.7) ** 2))
-            f, w = float(facing[item, node]), float(targets.weight[item, node])
+            f, w = float(nodes.exists[item, node]), float(targets.weight[item, node])
             expected = w * (f * 0.5 * rho + (1 - f) * term.fitted_level)
             assert float(value[item, node]) == pytest.approx(expected, abs=1e-12)
 
@@ -69,14 +68,13 @@ def test_derivatives_are_those_of_autograd(
     camera, field, term = make_camera(distortion), a_field(generator), SurfaceTerm()
     (points, normals), targets = some_nodes(generator), some_targets(generator)
     nodes = facing_nodes(points, normals, camera.centre_world)
-    facing = front_facing(points, normals, camera.centre_world)
     cost = term.point_cost(nodes, camera, field, targets)
     torch.testing.assert_close(cost.value, term.value(nodes, camera, field, targets))
 
     def total(at: Tensor) -> Tensor:
         error = field.value(camera.project(at).uv) - targets.level
         rho = Leclerc(nu=term.nu, sigma=term.sigma)(error.square()).rho
-        return (targets.weight * facing * 0.5 * rho).sum()
+        return (targets.weight * nodes.exists * 0.5 * rho).sum()
 
     at = points.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(total(at), at, create_graph=True)

@@ -20,7 +20,7 @@ from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.visibility import (
     ContourPredictor,
     SeenNodes,
-    front_facing,
+    facing_nodes,
     line_of_sight,
     visible_nodes,
 )
@@ -87,7 +87,7 @@ def check_against_rays(body: BodyModel, x: Tensor) -> None:
     assert 0.1 < float(truth.double().mean()) < 0.9
     check(body, x, points, own, hidden, truth, by_own=False)
     # Facing: of convex parts exactly the nodes that face away are hidden by their own part.
-    away = front_facing(inner.points, inner.normals, EYE) == 0
+    away = facing_nodes(inner.points, inner.normals, EYE).exists == 0
     truth = is_hidden(body, pose, EYE, inner.points, interior.node_part, by_own=True)
     if not body.part_shape[:, 7].any():
         check(body, x, inner.points, interior.node_part, away, truth, by_own=True)

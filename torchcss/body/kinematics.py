@@ -35,7 +35,7 @@ from torchcss.body.chain import (
     offset_matrix,
 )
 from torchcss.body.rotations import frame_along
-from torchcss.errors import BodyError, ShapeError, check_shape
+from torchcss.errors import BodyError, check_shape
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
 
@@ -202,15 +202,13 @@ class KinematicTree(nn.Module):
     def forward(
         self,
         q: Float[Tensor, "*batch q"],
-        base_rotation: Float[Tensor, "3 3"] | None = None,
-        base_translation: Float[Tensor, "3"] | None = None,
+        base: Float[Tensor, "3 4"] | None = None,
     ) -> TreePose:
         """Pose the tree.
 
         Args:
             q: Joint values, radians and metres.
-            base_rotation: Orientation of the root link's frame in the world.
-            base_translation: Origin of the root link's frame in the world, metres.
+            base: Axes and origin of the root link's frame in the world; None: the world's own.
 
         Returns:
             Link poses and joint twists in the world frame.
@@ -218,8 +216,7 @@ class KinematicTree(nn.Module):
         check_shape("q", q, self.num_joints)
         batch = q.shape[:-1]
         flat = q.reshape(batch.numel(), self.num_joints)
-        self._check_type(q)
-        base = _base(q, base_rotation, base_translation)
+        base = torch.eye(3, 4).to(q) if base is None else base
         if _plain(base) is not None and (values := _plain(flat)) is not None:
             posed = self._pose_links(values, base)
             return TreePose(*(torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in posed))
@@ -229,13 +226,6 @@ class KinematicTree(nn.Module):
         return TreePose(
             *(p.movedim(-1, 0).unflatten(0, batch) if batch else p[..., 0] for p in parts)
         )
-
-    def _check_type(self, q: Tensor) -> None:
-        if q.dtype != self.lower.dtype:
-            raise ShapeError(
-                f"the state is {q.dtype} and the body {self.lower.dtype}: convert one, "
-                "for example with body.to(x.dtype)"
-            )
 
     def _pose_links(self, q: np.ndarray, base: Tensor) -> tuple[np.ndarray, ...]:
         """What `TreePose` holds, by the compiled twin."""
@@ -298,16 +288,6 @@ def _plain(q: Tensor) -> np.ndarray | None:
         return q.detach().contiguous().numpy()
     except RuntimeError:  # a tensor inside a transform of torch.func has no memory
         return None
-
-
-def _base(q: Tensor, rotation: Tensor | None, translation: Tensor | None) -> Tensor:
-    """Axes and origin of the root link's frame, `[3 4]`."""
-    base = torch.eye(3, 4, dtype=q.dtype, device=q.device)
-    if rotation is not None:
-        base = torch.cat([rotation.to(q), base[:, 3:]], dim=1)
-    if translation is not None:
-        base = torch.cat([base[:, :3], translation.to(q)[:, None]], dim=1)
-    return base
 
 
 class _Level(NamedTuple):

@@ -233,7 +233,8 @@ def lift_with_shape(
     six = wrench(points[..., None].expand_as(force), force)
     six = six + wrench(w, cost.gradient[..., None].expand_as(w), couple=True)
     slope, square, six = (
-        _per_part(part, point_part, body.num_parts) for part in (slope, square, six)
+        each.new_zeros(body.num_parts, *each.shape[1:]).index_add(0, point_part, each)
+        for each in (slope, square, six)
     )
     twist = torch.cat([pose.tree.omega, pose.tree.velocity], dim=-1)  # q 6
     above = body.tree.ancestors[:, body.part_link].to(twist)  # q parts
@@ -243,7 +244,3 @@ def lift_with_shape(
     rows = (torch.cat([by_state.hessian, mixed], dim=1), torch.cat([mixed.T, by_shape], dim=1))
     gradient = torch.cat([by_state.gradient, slope.flatten() @ parameters.tie])
     return LocalModel(by_state.value, gradient, torch.cat(rows))
-
-
-def _per_part(values: Float[Tensor, "p ..."], part: Tensor, num: int) -> Float[Tensor, "parts ..."]:
-    return values.new_zeros(num, *values.shape[1:]).index_add(0, part, values)

@@ -1,6 +1,6 @@
 """What the camera sees of a posed body: facing, occluding contours, self-occlusion (3.1 [IJRR]).
 
-**Back-facing.** A surface node p faces a camera at c where `n . (c - p) > 0`, see `front_facing`.
+**Back-facing.** A surface node p faces a camera at c where `n . (c - p) > 0`, see `facing_nodes`.
 
 **Occluding contours.** The occluding contour of a part is where its normals are perpendicular to
 the line of sight. On the part's mesh it crosses every ring (a closed curve around the part) and
@@ -234,22 +234,6 @@ def contour_nodes(posed: Posed) -> SeenNodes:
     return predictor(posed.body, posed.pose, posed.camera.centre_world)
 
 
-def front_facing(points: Vectors, normals: Vectors, centre_world: Place) -> Values:
-    """Whether surface nodes face the camera: 0 where they face away, 1 where clearly towards it.
-
-    The ramp between starts where the line of sight grazes the surface.
-
-    Args:
-        points: Nodes, world frame, metres.
-        normals: Their unit outward normals.
-        centre_world: The camera's centre, metres.
-    """
-    towards = centre_world.to(points) - points
-    distance = towards.norm(dim=-1)
-    along = (normals * towards).sum(-1)
-    return (along / (_GRAZING * torch.where(distance > 0, distance, 1.0))).clamp(0, 1)
-
-
 def visible_nodes(
     body: BodyModel,
     pose: BodyPose,
@@ -261,7 +245,7 @@ def visible_nodes(
 ) -> Values:
     """Visibility of surface nodes past the other parts: 1 where seen, 0 where hidden.
 
-    A node that faces away is hidden by its own part besides, see `front_facing`.
+    A node that faces away is hidden by its own part besides, see `facing_nodes`.
 
     Args:
         body: The body.
@@ -280,12 +264,18 @@ def visible_nodes(
 def facing_nodes(points: Vectors, normals: Vectors, centre_world: Place) -> SeenNodes:
     """Surface nodes with which of them face the camera, as if nothing were in front of them.
 
+    0 where they face away, 1 where clearly towards it; the ramp between starts where the line of
+    sight grazes the surface.
+
     Args:
         points: Nodes, world frame, metres.
         normals: Their unit outward normals.
         centre_world: The camera's centre, metres.
     """
-    facing = front_facing(points, normals, centre_world)
+    towards = centre_world.to(points) - points
+    distance = towards.norm(dim=-1)
+    along = (normals * towards).sum(-1)
+    facing = (along / (_GRAZING * torch.where(distance > 0, distance, 1.0))).clamp(0, 1)
     return SeenNodes(points, normals, facing, torch.ones_like(facing))
 
 

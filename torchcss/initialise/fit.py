@@ -128,7 +128,8 @@ def initialise(
     """
     options = options or InitialiseOptions()
     if not isinstance(keypoints, Keypoints):
-        keypoints = keypoints_by_name(keypoints, own=_own_joints(body))
+        own = body if isinstance(body, BodyModel) else load_body(body)
+        keypoints = keypoints_by_name(keypoints, own=own.joint_of_name)
     check_numbers(keypoints, frames=False)
     camera, notes = _camera_of(image, camera)
     view = CameraView(camera.to(dtype=options.dtype, device=options.device), keypoints)
@@ -174,11 +175,6 @@ def _misses(alone: TrackingCost, x: Vector) -> str | None:
         f"keypoints: the best fit misses them by more than {_POOR_FIT:g} times the noise of "
         f"{joints.sigma:.1f} px that is given: {_NO_POSE}"
     )
-
-
-def _own_joints(body: str | BodyModel) -> dict[str, str]:
-    """Joints of a body under its file's names."""
-    return (body if isinstance(body, BodyModel) else load_body(body)).joint_of_name
 
 
 def _fit_of_size(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.errors import MissingExtraError
+from torchcss.errors import optional_package
 from torchcss.vision.camera import Camera
 
 if TYPE_CHECKING:
@@ -30,14 +30,9 @@ def rerun() -> ModuleType:
     Raises:
         MissingExtraError: If it is not installed.
     """
-    try:
-        import rerun as rr
-        import rerun.blueprint
-    except ImportError as error:
-        raise MissingExtraError(
-            'the viewer needs the package rerun-sdk: pip install "torchcss[viewer]"'
-        ) from error
-    return rr
+    message = 'the viewer needs the package rerun-sdk: pip install "torchcss[viewer]"'
+    optional_package("rerun.blueprint", message)
+    return optional_package("rerun", message)
 
 
 def world_axes(up: str) -> rr.ViewCoordinates:
