@@ -60,7 +60,7 @@ def test_bodies_at_their_limits() -> None:
         bounds = body.bounds
         x = torch.stack([bounds.lower, bounds.upper, body.rest])
         x = torch.where(x.isfinite(), x, 1e3)
-        model = Stabiliser().local_model(x, body.sticky_mean, body.sticky_deviation)
+        model = long_tailed(x, body.sticky_mean, body.sticky_deviation, Stabiliser.nu)
         for part in model:
             assert torch.isfinite(part).all()
         leaf = x.clone().requires_grad_()
@@ -76,7 +76,7 @@ def test_bodies_at_their_limits() -> None:
 def test_no_prior_at_all() -> None:
     x = torch.randn(3, 2, dtype=torch.float64)
     nothing = torch.full((2,), math.inf, dtype=torch.float64)
-    for part in Stabiliser().local_model(x, 0 * nothing.reciprocal(), nothing):
+    for part in long_tailed(x, 0 * nothing.reciprocal(), nothing, 9.0):
         assert not part.any()
 
 
@@ -86,7 +86,7 @@ def test_no_prior_at_all() -> None:
 )
 def test_far_tails_stay_finite(dtype: torch.dtype, far: float) -> None:
     x = torch.tensor([[far], [-far]], dtype=dtype)
-    model = Stabiliser().local_model(x, torch.zeros(1).to(dtype), torch.ones(1).to(dtype))
+    model = long_tailed(x, torch.zeros(1).to(dtype), torch.ones(1).to(dtype), 9.0)
     for part in model:
         assert part.dtype == dtype
         assert torch.isfinite(part).all()

@@ -34,7 +34,7 @@ def long_tailed(
     deviation: Float[Tensor, " n"],
     nu: float,
 ) -> LocalModel:
-    """Sum over parameters of the Lorentzian prior about `centre`, with its derivatives.
+    """Sum over parameters of the Lorentzian prior about `centre`; its Hessian is diagonal.
 
     Args:
         x: States.
@@ -72,7 +72,7 @@ class Stabiliser(Term):
     def prepare(self, context: FrameContext) -> OnStates:
         """Bind the prior to the rest values of a body."""
         mean, deviation = context.body.sticky_mean, self.deviation(context.body)
-        return OnStates(lambda posed, _: self.local_model(posed.x, mean, deviation))
+        return OnStates(lambda posed, _: long_tailed(posed.x, mean, deviation, self.nu))
 
     def deviation(self, body: BodyModel) -> Float[Tensor, " n"]:
         """Standard deviations of a body's parameters; infinite where free."""
@@ -83,18 +83,3 @@ class Stabiliser(Term):
             free += [k for k, name in enumerate(body.state_names) if name.endswith(_SEEN)]
         deviation[free] = math.inf
         return deviation
-
-    def local_model(
-        self,
-        x: Float[Tensor, "*batch n"],
-        mean: Float[Tensor, " n"],
-        deviation: Float[Tensor, " n"],
-    ) -> LocalModel:
-        """Cost, gradient and (diagonal) Hessian.
-
-        Args:
-            x: States.
-            mean: Rest values, `BodyModel.sticky_mean`.
-            deviation: Standard deviations, `BodyModel.sticky_deviation`; infinite where free.
-        """
-        return long_tailed(x, mean, deviation, self.nu)

@@ -22,7 +22,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.stabiliser import Stabiliser, long_tailed
 from torchcss.errors import ShapeError, check_shape
 from torchcss.types import LocalModel, PointCost, frozen
 
@@ -106,7 +106,6 @@ class PointDistances:
         offset: Its place in that link's frame, metres.
         target: Where it should be in the world, item by item, metres.
         sigma: Its standard deviation, metres.
-        stabiliser: The prior on what the points do not tell.
         repulsion: Keeps parts out of each other, if `pairs` are there too.
         pairs: Which parts may collide.
     """
@@ -116,7 +115,6 @@ class PointDistances:
     offset: Float[Tensor, "p 3"]
     target: Float[Tensor, "b p 3"]
     sigma: Float[Tensor, " p"]
-    stabiliser: Stabiliser = Stabiliser()
     repulsion: Interpenetration | None = None
     pairs: InterpenetrationPairs | None = None
 
@@ -134,12 +132,12 @@ class PointDistances:
         points = body.points_on_links(pose.tree, self.link, self.offset)
         cost = squared_errors(points - self.target, self.sigma.pow(-2))
         total = body.lift(pose, points, self.link, cost)
-        priors = [self.stabiliser.local_model(x, body.sticky_mean, body.sticky_deviation)]
-        if self.repulsion is not None and self.pairs is not None:
-            priors.append(self.repulsion.local_model(body, pose, self.pairs))
-        for prior in priors:
-            total = total.plus(prior)
-        return total
+        # What the points do not tell.
+        sticky = long_tailed(x, body.sticky_mean, body.sticky_deviation, Stabiliser.nu)
+        total = total.plus(sticky)
+        if self.repulsion is None or self.pairs is None:
+            return total
+        return total.plus(self.repulsion.local_model(body, pose, self.pairs))
 
 
 def squared_errors(error: Float[Tensor, "*batch p 3"], weight: Float[Tensor, " p"]) -> PointCost:

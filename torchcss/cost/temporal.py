@@ -45,23 +45,8 @@ class TemporalPrior(Term):
         if prior is None or deviation is None:
             return None
         return OnStates(
-            lambda posed, _: self.local_model(posed.x, posed.of_parent(prior.mean), deviation)
+            lambda posed, _: long_tailed(posed.x, posed.of_parent(prior.mean), deviation, self.nu)
         )
-
-    def local_model(
-        self,
-        x: Float[Tensor, "*batch n"],
-        parent: Float[Tensor, "*#batch n"],
-        deviation: Float[Tensor, " n"],
-    ) -> LocalModel:
-        """Cost, gradient and (diagonal) Hessian.
-
-        Args:
-            x: States.
-            parent: The state of each sample's parent mode at the previous frame.
-            deviation: Expected motion per frame; infinite where nothing is known.
-        """
-        return long_tailed(x, parent, deviation, self.nu)
 
 
 class MixtureDensity(NamedTuple):
