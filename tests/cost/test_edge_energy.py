@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchcss.cost.edge_energy import EdgeEnergyTerm, SplineField, edge_energy_field
 from torchcss.cost.visibility import SeenNodes
-from torchcss.errors import ShapeError
 from torchcss.robust import Leclerc, Lorentzian
 from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
@@ -228,14 +227,3 @@ def test_types_and_awkward_points(dtype: torch.dtype, generator: torch.Generator
     ):
         for part in term.point_cost(SeenNodes(far, far, one, one), camera, small):
             assert torch.isfinite(part).all()
-
-
-def test_bad_fields_are_refused() -> None:
-    for bad in (
-        torch.zeros(3, 4),
-        torch.zeros(3, 4, 5),
-        torch.zeros(2, 0, 5),
-        torch.zeros(2, 3, 3).int(),
-    ):
-        with pytest.raises(ShapeError, match=r"expected a floating-point field \[2, h, w\]"):
-            edge_energy_field(bad)

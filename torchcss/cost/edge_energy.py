@@ -34,7 +34,6 @@ from torch import Tensor
 from torchcss.cost.context import FrameContext
 from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
 from torchcss.cost.term import OnPoints, Values
-from torchcss.errors import ShapeError
 from torchcss.robust import Lorentzian, RobustPotential
 from torchcss.types import frozen
 from torchcss.vision.sampling import gaussian_blur
@@ -53,20 +52,7 @@ def edge_energy_field(edge_field: Float[Tensor, "2 h w"]) -> SplineField:
     Args:
         edge_field: Edge energy times direction, weighted or not, of length at most one; see
             `FrameFeatures.edge_field`.
-
-    Raises:
-        ShapeError: If the field is not a floating-point `[2, h, w]` with at least one pixel.
     """
-    if (
-        edge_field.ndim != 3
-        or edge_field.shape[0] != 2
-        or edge_field.numel() == 0
-        or not edge_field.is_floating_point()
-    ):
-        raise ShapeError(
-            "edge_field: expected a floating-point field [2, h, w] with at least one pixel, "
-            f"got {edge_field.dtype} {list(edge_field.shape)}"
-        )
     energy = gaussian_blur(edge_field.norm(dim=0), _SMOOTHING)
     # The spline's own kernel has a variance of 1/3.
     height = math.sqrt(1.0 + (_SMOOTHING**2 + 1.0 / 3.0) / _RIDGE**2)
