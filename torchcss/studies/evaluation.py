@@ -15,9 +15,7 @@ several runs one of medians. What the words mean (the figures are those of `Thre
 * A *limb* is lost at the first frame from which on one and the same joint is farther than that from
   where it is for half a second: in the best mode, and, as with all that is said to be of the modes,
   in the one nearest to the truth. A mean over the joints forgives an arm that points elsewhere.
-* The *true mode is kept* if the mean root-aligned error of any mode is below 100 mm; in angles, if
-  the true angles lie within three standard deviations of any mode (root of the mean squared
-  Mahalanobis distance per parameter).
+* The *true mode is kept* if the mean root-aligned error of any mode is below 100 mm.
 * *Calibration*: how often the true joints lie in the 50, 90, and 95 % regions of a mode, the
   joint's covariance (`torchcss.body.uncertainty`) enlarged by the reference's own.
 * *Along* and *across* are root mean square errors of the best mode's joints, roots on each other,
@@ -42,8 +40,7 @@ from jaxtyping import Bool, Float, Int
 
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
-from torchcss.body.root import ROOT_NAMES, has_root, move_base
-from torchcss.body.rotations import within_half_turn
+from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cost.part_map import part_map
 from torchcss.cost.penetration import PenetrationDepth
@@ -92,9 +89,6 @@ APART_M = 0.03
 OfModes = Float[np.ndarray, "k j"]
 """A number for every compared joint of every mode."""
 
-_PLACE = ROOT_NAMES[:3]
-"""Where a body stands."""
-
 
 @frozen
 class Thresholds:
@@ -105,7 +99,6 @@ class Thresholds:
         least_overlap: Overlap below which it has.
         regain_s: How long failing has to last to be a loss.
         true_mode_mm: Error below which a mode is the true one.
-        true_mode_deviations: Standard deviations per angle below which it is.
         outside_degrees: How far an angle may pass its limit.
         deep_m: How deep parts may penetrate, metres.
         reference_m: Standard deviation of the reference per coordinate, metres.
@@ -115,7 +108,6 @@ class Thresholds:
     least_overlap: float = 0.5
     regain_s: float = REGAIN_S
     true_mode_mm: float = 100.0
-    true_mode_deviations: float = 3.0
     outside_degrees: float = 1.0
     deep_m: float = 0.02
     reference_m: float = 0.02
@@ -146,8 +138,6 @@ class FrameMeasures(NamedTuple):
         root_aligned_mm: The same with the roots on each other.
         procrustes_mm: The same after the best similarity.
         within: Probability of the region of a mode that just holds the true joint.
-        angle_deviations: Standard deviations per angle between a mode and the truth; NaN if the
-            true angles are not known.
         joints_m: Compared joints of the best mode, metres.
         reference_m: Where they should be; NaN where unknown.
         overlap: Of the best mode's silhouette with the true one; NaN if that is not known.
@@ -157,7 +147,6 @@ class FrameMeasures(NamedTuple):
         across_mm: Error across it.
         apart_weight: Weight of the modes that are another explanation than the best one.
         at_bound: Parameters of the best mode at their bounds.
-        samples: Samples drawn.
         evaluations: Evaluations of the cost: with two derivatives for each iteration of a
             descending sample, or the value alone for each weighing of a particle.
         seconds: Wall time by stage.
@@ -171,7 +160,6 @@ class FrameMeasures(NamedTuple):
     root_aligned_mm: OfModes
     procrustes_mm: OfModes
     within: OfModes
-    angle_deviations: Float[np.ndarray, " k"]
     joints_m: Float[np.ndarray, "j 3"]
     reference_m: Float[np.ndarray, "j 3"]
     overlap: float
@@ -181,7 +169,6 @@ class FrameMeasures(NamedTuple):
     across_mm: float
     apart_weight: float
     at_bound: tuple[str, ...]
-    samples: int
     evaluations: int
     seconds: dict[str, float]
 
@@ -348,7 +335,6 @@ class Evaluator:
             root_aligned_mm=aligned,
             procrustes_mm=procrustes_errors_mm(joints[:, :count], reference[:count]),
             within=within,
-            angle_deviations=self._angle_deviations(tracked),
             joints_m=joints[0, :count],
             reference_m=reference[:count],
             overlap=overlap,
@@ -358,7 +344,6 @@ class Evaluator:
             across_mm=across,
             apart_weight=_apart_weight(joints, weight),
             at_bound=_at_bound(body, mixture.mean[0]),
-            samples=int(tracked.info.num_samples),
             evaluations=num_evaluations(tracked.info),
             seconds={
                 "features": features_s,
@@ -383,23 +368,6 @@ class Evaluator:
         along = away[known] @ (sight / np.linalg.norm(sight))
         squared = (away[known] ** 2).sum(-1) - along**2
         return 1000 * float(np.sqrt((along**2).mean())), 1000 * float(np.sqrt(squared.mean()))
-
-    def _angle_deviations(self, tracked: Posterior) -> np.ndarray:
-        """Standard deviations per angle between each mode and the truth."""
-        truth, body, mixture = self.sequence.truth, tracked.body, tracked.state.mixture
-        spread = tracked.covariance.double().cpu()
-        if truth is None or truth.body.state_names != body.state_names:
-            return np.full(len(mixture.mean), np.nan)
-        x = truth.states[tracked.frame.index]
-        turn, shift = (part.double().cpu() for part in (body.base_rotation, body.base_translation))
-        angles = list(range(body.num_parameters))
-        if self._rooted:
-            _, x, _ = move_base(truth.body, turn, shift, x)
-            # Where the body stands goes with its size, which one image does not tell.
-            angles = [body.state_index(name) for name in body.state_names if name not in _PLACE]
-        away = within_half_turn((x - mixture.mean.double().cpu())[:, angles])
-        spread = spread[:, angles][:, :, angles]
-        return (squared_mahalanobis(away, spread) / len(angles)).sqrt().numpy()
 
 
 def _apart_weight(joints: Float[np.ndarray, "k j 3"], weight: Float[np.ndarray, " k"]) -> float:
@@ -458,10 +426,8 @@ def summarise(
         "num_frames": len(measures),
         "lost": lost is not None,
         "lost_s": math.nan if lost is None else times[lost],
-        "failed_share": _mean(every("failed")),
         "limb_lost_s": limb_loss([m.root_aligned_mm[0] for m in measures], times, thresholds),
         "limb_lost_of_modes_s": limb_loss(nearest, times, thresholds),
-        "num_frames_held": len(held) if lost is None else lost,
         **_errors(held),
         **_modes(held, thresholds),
         "overlap": _mean(every("overlap", held)),
@@ -470,7 +436,7 @@ def summarise(
         ),
         **_impossible(held, thresholds),
         **{name: _mean(every(name, held)) for name in ("along_mm", "across_mm", "apart_weight")},
-        **{f"{name}_per_frame": _mean(every(name)) for name in ("samples", "evaluations")},
+        "evaluations_per_frame": _mean(every("evaluations")),
         **{
             f"{stage}_s_per_frame": _mean([m.seconds[stage] for m in measures])
             for stage in measures[0].seconds
@@ -488,26 +454,11 @@ def summarise(
 
 
 def _modes(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[str, float]:
-    """How many modes there are, whether the true one is among them, and calibration."""
+    """Whether the true mode is among them, and calibration."""
     near = [_nearest(m) for m in held]
-    told = [
-        (m, n) for m, n in zip(held, near, strict=True) if not np.isnan(m.root_aligned_mm).all()
-    ]
-    several = [(m, n) for m, n in told if len(m.weight) > 1]
-    with_angles = [m for m in held if not np.isnan(m.angle_deviations).all()]
-    row = {
-        "true_mode_kept": _mean(
-            [_mean(m.root_aligned_mm[n]) < thresholds.true_mode_mm for m, n in told]
-        ),
-        "true_angles_kept": _mean(
-            [np.nanmin(m.angle_deviations) < thresholds.true_mode_deviations for m in with_angles]
-        ),
-        "modes": _mean([len(m.weight) for m in held]),
-        # Of a calibrated mixture these two are equal: how sure it is of its best mode, and how
-        # often that is the nearest to the truth, where it has more than one.
-        "best_weight": _mean([m.weight[0] for m, _ in several]),
-        "best_is_nearest": _mean([n == 0 for _, n in several]),
-    }
+    errors = [_mean(m.root_aligned_mm[n]) for m, n in zip(held, near, strict=True)]
+    known = [error < thresholds.true_mode_mm for error in errors if not math.isnan(error)]
+    row = {"true_mode_kept": _mean(known)}
     for name, which in (("best", [0] * len(held)), ("nearest", near)):
         inside = np.stack([m.within[n] for m, n in zip(held, which, strict=True)])
         row |= {f"inside_{round(100 * p)}_{name}": s for p, s in coverage(inside).items()}
@@ -515,7 +466,7 @@ def _modes(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[str, f
 
 
 def _impossible(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[str, float]:
-    """Shares of frames with poses that no body can take, and the worst of them."""
+    """Shares of frames with poses that no body can take."""
     best = np.array([m.penetration_m[0] for m in held])
     modes = np.concatenate([m.penetration_m for m in held])
     outside = np.array([m.outside_degrees for m in held])
@@ -523,9 +474,6 @@ def _impossible(held: Sequence[FrameMeasures], thresholds: Thresholds) -> dict[s
         "outside_share": _mean(outside > thresholds.outside_degrees),
         "deep_share": _mean(best > thresholds.deep_m),
         "deep_modes_share": _mean(modes > thresholds.deep_m),
-        "outside_degrees": float(outside.max()),
-        "penetration_mm": 1000 * float(best.max()),
-        "penetration_modes_mm": 1000 * float(modes.max()),
     }
 
 
