@@ -144,6 +144,11 @@ class Claim(NamedTuple):
     judge: Judge
 
 
+def by(judge: Callable[..., Finding], *given: Any, **options: Any) -> Judge:
+    """A judge that also looks at what is given, such as a sequence and a tracker."""
+    return lambda evidence: judge(evidence, *given, **options)
+
+
 def failed_s(run: Mapping[str, Any]) -> float:
     """When a run has failed; infinite if it never did."""
     times = [run[key] for key in ("lost_s", "limb_lost_of_modes_s") if run[key] is not None]
@@ -166,78 +171,56 @@ def typical(runs: list[dict[str, Any]], key: str) -> float:
     return median(run[key] for run in runs if run[key] is not None)
 
 
-def fails(sequence: str, preset: str) -> Judge:
+def fails(evidence: Evidence, sequence: str, preset: str) -> Finding:
     """A tracker fails in most of its runs."""
-
-    def judge(evidence: Evidence) -> Finding:
-        runs = evidence.of(sequence, preset)
-        return Finding(told(runs), median(map(failed_s, runs)) < math.inf)
-
-    return judge
+    runs = evidence.of(sequence, preset)
+    return Finding(told(runs), median(map(failed_s, runs)) < math.inf)
 
 
-def tracks(sequence: str, preset: str) -> Judge:
+def tracks(evidence: Evidence, sequence: str, preset: str) -> Finding:
     """A tracker fails in none of its runs."""
-
-    def judge(evidence: Evidence) -> Finding:
-        runs = evidence.of(sequence, preset)
-        error = typical(runs, "root_aligned_best_of_modes_mm")
-        return Finding(
-            f"failed: {told(runs)}; until then {error:.0f} mm in the nearest mode",
-            all(math.isinf(failed_s(run)) for run in runs),
-        )
-
-    return judge
+    runs = evidence.of(sequence, preset)
+    error = typical(runs, "root_aligned_best_of_modes_mm")
+    return Finding(
+        f"failed: {told(runs)}; until then {error:.0f} mm in the nearest mode",
+        all(math.isinf(failed_s(run)) for run in runs),
+    )
 
 
-def outlasts(sequence: str, better: str, worse: str) -> Judge:
+def outlasts(evidence: Evidence, sequence: str, better: str, worse: str) -> Finding:
     """A tracker fails later than another."""
-
-    def judge(evidence: Evidence) -> Finding:
-        one, two = evidence.of(sequence, better), evidence.of(sequence, worse)
-        return Finding(
-            f"{better}: {told(one)}; {worse}: {told(two)}",
-            median(map(failed_s, one)) > median(map(failed_s, two)),
-        )
-
-    return judge
+    one, two = evidence.of(sequence, better), evidence.of(sequence, worse)
+    return Finding(
+        f"{better}: {told(one)}; {worse}: {told(two)}",
+        median(map(failed_s, one)) > median(map(failed_s, two)),
+    )
 
 
-def in_depth(sequence: str, preset: str) -> Judge:
+def in_depth(evidence: Evidence, sequence: str, preset: str) -> Finding:
     """Errors along the line of sight are more than twice those across it."""
-
-    def judge(evidence: Evidence) -> Finding:
-        runs = evidence.of(sequence, preset)
-        along, across = typical(runs, "along_mm"), typical(runs, "across_mm")
-        return Finding(f"{along:.0f} mm along, {across:.0f} mm across", along > 2 * across)
-
-    return judge
+    runs = evidence.of(sequence, preset)
+    along, across = typical(runs, "along_mm"), typical(runs, "across_mm")
+    return Finding(f"{along:.0f} mm along, {across:.0f} mm across", along > 2 * across)
 
 
-def share(sequence: str, preset: str, key: str, words: str, least: float = 0.0) -> Judge:
+def share(
+    evidence: Evidence, sequence: str, preset: str, key: str, words: str, least: float = 0.0
+) -> Finding:
     """Something happens in more than a share of a tracker's frames."""
-
-    def judge(evidence: Evidence) -> Finding:
-        value = typical(evidence.of(sequence, preset), key)
-        return Finding(f"{words} in {100 * value:.1f} % of the frames", value > least)
-
-    return judge
+    value = typical(evidence.of(sequence, preset), key)
+    return Finding(f"{words} in {100 * value:.1f} % of the frames", value > least)
 
 
-def hits_elbow(sequence: str, preset: str) -> Judge:
+def hits_elbow(evidence: Evidence, sequence: str, preset: str) -> Finding:
     """The elbow is at its bound when the track fails."""
-
-    def judge(evidence: Evidence) -> Finding:
-        runs = evidence.of(sequence, preset)
-        hits = [_elbow_hit(run) for run in runs]
-        least = median(hits)
-        words = "never" if math.isinf(least) else f"first at {least:.1f} s"
-        return Finding(
-            f"elbow at its bound: {words} (median); failed: {told(runs)}",
-            median(map(failed_s, runs)) < math.inf and least <= median(map(failed_s, runs)),
-        )
-
-    return judge
+    runs = evidence.of(sequence, preset)
+    hits = [_elbow_hit(run) for run in runs]
+    least = median(hits)
+    words = "never" if math.isinf(least) else f"first at {least:.1f} s"
+    return Finding(
+        f"elbow at its bound: {words} (median); failed: {told(runs)}",
+        median(map(failed_s, runs)) < math.inf and least <= median(map(failed_s, runs)),
+    )
 
 
 def _elbow_hit(run: Mapping[str, Any]) -> float:
@@ -247,40 +230,32 @@ def _elbow_hit(run: Mapping[str, Any]) -> float:
     )
 
 
-def multimodal(sequence: str, preset: str) -> Judge:
+def multimodal(evidence: Evidence, sequence: str, preset: str) -> Finding:
     """Other explanations weigh in some frames, and more so while the body moves in depth."""
-
-    def judge(evidence: Evidence) -> Finding:
-        runs = evidence.of(sequence, preset)
-        if sequence not in evidence.depth:
-            raise Missing("the sequence is not given")
-        deep, flat = [], []
-        for run in runs:
-            weight = np.array(run["per_frame"]["apart_weight"], np.float64)[1:]
-            depth = evidence.depth[sequence][: len(weight)]
-            much = depth > np.median(depth)
-            deep.append(float(weight[much].mean()))
-            flat.append(float(weight[~much].mean()))
-        often = multimodal_share(runs)
-        return Finding(
-            f"weight of other explanations: {median(deep):.2f} in the half of the frames that "
-            f"moves most in depth, {median(flat):.2f} in the other; above {MULTIMODAL:g} in "
-            f"{100 * often:.0f} % of the frames",
-            often > SOME and all(one > two for one, two in zip(deep, flat, strict=True)),
-        )
-
-    return judge
+    runs = evidence.of(sequence, preset)
+    if sequence not in evidence.depth:
+        raise Missing("the sequence is not given")
+    deep, flat = [], []
+    for run in runs:
+        weight = np.array(run["per_frame"]["apart_weight"], np.float64)[1:]
+        depth = evidence.depth[sequence][: len(weight)]
+        much = depth > np.median(depth)
+        deep.append(float(weight[much].mean()))
+        flat.append(float(weight[~much].mean()))
+    often = multimodal_share(runs)
+    return Finding(
+        f"weight of other explanations: {median(deep):.2f} in the half of the frames that "
+        f"moves most in depth, {median(flat):.2f} in the other; above {MULTIMODAL:g} in "
+        f"{100 * often:.0f} % of the frames",
+        often > SOME and all(one > two for one, two in zip(deep, flat, strict=True)),
+    )
 
 
-def mostly_multimodal(sequence: str, preset: str) -> Judge:
+def mostly_multimodal(evidence: Evidence, sequence: str, preset: str) -> Finding:
     """Other explanations weigh in most frames."""
-
-    def judge(evidence: Evidence) -> Finding:
-        often = multimodal_share(evidence.of(sequence, preset))
-        words = f"other explanations weigh more than {MULTIMODAL:g} in {100 * often:.0f} % of the"
-        return Finding(f"{words} frames", often > 0.5)
-
-    return judge
+    often = multimodal_share(evidence.of(sequence, preset))
+    words = f"other explanations weigh more than {MULTIMODAL:g} in {100 * often:.0f} % of the"
+    return Finding(f"{words} frames", often > 0.5)
 
 
 def multimodal_share(runs: list[dict[str, Any]]) -> float:
@@ -289,18 +264,16 @@ def multimodal_share(runs: list[dict[str, Any]]) -> float:
     return median(float((weight > MULTIMODAL).mean()) for weight in weights)
 
 
-def at_all_scales(words: str, better: Callable[[Mapping, Mapping], tuple[str, bool]]) -> Judge:
+def at_all_scales(
+    evidence: Evidence, words: str, better: Callable[[Mapping, Mapping], tuple[str, bool]]
+) -> Finding:
     """CSS against SS at scales 1, 4 and 8."""
-
-    def judge(evidence: Evidence) -> Finding:
-        told_by_scale, holds = [], True
-        for scale in (1.0, 4.0, 8.0):
-            seen, so = better(evidence.row("CSS", scale), evidence.row("SS", scale))
-            told_by_scale.append(f"{seen} at {scale:g}")
-            holds &= so
-        return Finding(f"{words}: {', '.join(told_by_scale)}", holds)
-
-    return judge
+    told_by_scale, holds = [], True
+    for scale in (1.0, 4.0, 8.0):
+        seen, so = better(evidence.row("CSS", scale), evidence.row("SS", scale))
+        told_by_scale.append(f"{seen} at {scale:g}")
+        holds &= so
+    return Finding(f"{words}: {', '.join(told_by_scale)}", holds)
 
 
 def _minima(css: Mapping[str, Any], ss: Mapping[str, Any]) -> tuple[str, bool]:
@@ -369,37 +342,29 @@ def _range(numbers: list[float]) -> str:
     return f"{middle:.0f} ({least:.0f} to {most:.0f})"
 
 
-def varied(preset: str, change: str, *, better: bool) -> Judge:
+def varied(evidence: Evidence, preset: str, change: str, *, better: bool) -> Finding:
     """A variation's modes are nearer, or farther, on every sequence than those of any seed without.
 
     Judged is the nearest mode.
     """
-
-    def judge(evidence: Evidence) -> Finding:
-        words, holds = [], True
-        for name, (plain, other) in _pairs(evidence, preset, change).items():
-            before, after = (row["root_aligned_best_of_modes_mm"] for row in (plain, other))
-            words.append(f"{name}: {before[0]:.0f} mm ({before[1]:.0f} to {before[2]:.0f}), ")
-            words[-1] += f"{change} {_range(after)}"
-            holds &= after[0] < before[1] if better else after[0] > before[2]
-        return Finding(f"{preset}, {'; '.join(words)}", holds)
-
-    return judge
+    words, holds = [], True
+    for name, (plain, other) in _pairs(evidence, preset, change).items():
+        before, after = (row["root_aligned_best_of_modes_mm"] for row in (plain, other))
+        words.append(f"{name}: {before[0]:.0f} mm ({before[1]:.0f} to {before[2]:.0f}), ")
+        words[-1] += f"{change} {_range(after)}"
+        holds &= after[0] < before[1] if better else after[0] > before[2]
+    return Finding(f"{preset}, {'; '.join(words)}", holds)
 
 
-def tolerated(preset: str, *changes: str) -> Judge:
+def tolerated(evidence: Evidence, preset: str, *changes: str) -> Finding:
     """No more seeds lose the body or a limb than without the changes."""
-
-    def judge(evidence: Evidence) -> Finding:
-        words, holds = [], True
-        for change in changes:
-            for name, pair in _pairs(evidence, preset, change).items():
-                before, after = map(_all_held, pair)
-                words.append(f"{change}, {name}: {_told_held(after)}, else {_told_held(before)}")
-                holds &= after or not before
-        return Finding(f"{preset}, {'; '.join(words)}", holds)
-
-    return judge
+    words, holds = [], True
+    for change in changes:
+        for name, pair in _pairs(evidence, preset, change).items():
+            before, after = map(_all_held, pair)
+            words.append(f"{change}, {name}: {_told_held(after)}, else {_told_held(before)}")
+            holds &= after or not before
+    return Finding(f"{preset}, {'; '.join(words)}", holds)
 
 
 def _all_held(row: Mapping[str, Any]) -> bool:
@@ -445,21 +410,17 @@ def weights_help(evidence: Evidence) -> Finding:
     return Finding("; ".join(words), holds)
 
 
-def spectrum_of(bodies: tuple[str, ...], key: str, least: float) -> Judge:
+def spectrum_of(evidence: Evidence, bodies: tuple[str, ...], key: str, least: float) -> Finding:
     """Spectra of all costs of these bodies have at least a number."""
-
-    def judge(evidence: Evidence) -> Finding:
-        if not evidence.spectra:
-            raise Missing(f"no report of {SPECTRA} is given")
-        seen = {
-            of: median(run[key] for run in runs)
-            for of, runs in evidence.spectra.items()
-            if runs[0]["body"] in bodies
-        }
-        words = "; ".join(f"{value:.0f} ({of})" for of, value in seen.items())
-        return Finding(words, bool(seen) and min(seen.values()) >= least)
-
-    return judge
+    if not evidence.spectra:
+        raise Missing(f"no report of {SPECTRA} is given")
+    seen = {
+        of: median(run[key] for run in runs)
+        for of, runs in evidence.spectra.items()
+        if runs[0]["body"] in bodies
+    }
+    words = "; ".join(f"{value:.0f} ({of})" for of, value in seen.items())
+    return Finding(words, bool(seen) and min(seen.values()) >= least)
 
 
 def _frames(evidence: Evidence) -> Mapping[str, Mapping[str, Any]]:
@@ -493,147 +454,137 @@ def several_minima(evidence: Evidence) -> Finding:
     return Finding(f"minima along the least certain direction, {'; '.join(words)}", holds)
 
 
-def few_minima(scale: str, most: float) -> Judge:
+def few_minima(evidence: Evidence, scale: str, most: float) -> Finding:
     """In no frame more minima a line, in the mean, than so many."""
-
-    def judge(evidence: Evidence) -> Finding:
-        counts = {
-            name: row["num_minima"]
-            for name, frame in _frames(evidence).items()
-            for row in frame["table"]
-            if (row["term"], row["scale"]) == ("sum", scale)
-        }
-        words = "; ".join(f"{name}: {count:.1f}" for name, count in counts.items())
-        return Finding(f"minima a line, {words}", max(counts.values()) <= most)
-
-    return judge
+    counts = {
+        name: row["num_minima"]
+        for name, frame in _frames(evidence).items()
+        for row in frame["table"]
+        if (row["term"], row["scale"]) == ("sum", scale)
+    }
+    words = "; ".join(f"{name}: {count:.1f}" for name, count in counts.items())
+    return Finding(f"minima a line, {words}", max(counts.values()) <= most)
 
 
-def steadier(variant: str, than: str = "full") -> Judge:
+def steadier(evidence: Evidence, variant: str, than: str = "full") -> Finding:
     """Without a constraint the cheapest first poses are worse in all conditions."""
-
-    def judge(evidence: Evidence) -> Finding:
-        rows = evidence.first_poses
-        seen = {
-            condition: (rows[than, condition]["pa_best_mm"], row["pa_best_mm"])
-            for (other, condition), row in rows.items()
-            if other == variant and (than, condition) in rows
-        }
-        if not seen:
-            raise Missing(f"no report of {FIRST} {variant} is given")
-        words = "; ".join(f"{name}: {a:.0f} mm, {variant} {b:.0f}" for name, (a, b) in seen.items())
-        return Finding(words, all(a < b for a, b in seen.values()))
-
-    return judge
+    rows = evidence.first_poses
+    seen = {
+        condition: (rows[than, condition]["pa_best_mm"], row["pa_best_mm"])
+        for (other, condition), row in rows.items()
+        if other == variant and (than, condition) in rows
+    }
+    if not seen:
+        raise Missing(f"no report of {FIRST} {variant} is given")
+    words = "; ".join(f"{name}: {a:.0f} mm, {variant} {b:.0f}" for name, (a, b) in seen.items())
+    return Finding(words, all(a < b for a, b in seen.values()))
 
 
-def untested(why: str) -> Judge:
+def untested(_: Evidence, why: str) -> Finding:
     """A claim that no study of ours can judge."""
-
-    def judge(evidence: Evidence) -> Finding:
-        raise Missing(why)
-
-    return judge
+    raise Missing(why)
 
 
 FULL_BODIES = ("body30", "body32", "body34")
 
 CLAIMS: tuple[Claim, ...] = (
     Claim("Gaussian single mode slips off at the pillar (0.5 s and 2.2 s, arm)", "[IJRR] 6.1",
-          FAILURES, fails(ARM, "ijrr_gaussian_single")),
+          FAILURES, by(fails, ARM, "ijrr_gaussian_single")),
     Claim("Gaussian single mode slips off at the pillar (0.3 s, body)", "[IJRR] 6.1",
-          FAILURES, fails(CLUTTER, "ijrr_gaussian_single")),
+          FAILURES, by(fails, CLUTTER, "ijrr_gaussian_single")),
     Claim("a robust single mode takes motion in depth for motion in the image (arm)", "[IJRR] 6.1",
-          FAILURES, in_depth(ARM, "ijrr_robust_single")),
+          FAILURES, by(in_depth, ARM, "ijrr_robust_single")),
     Claim("a robust single mode takes motion in depth for motion in the image (body)", "[IJRR] 6.1",
-          FAILURES, in_depth(CLUTTER, "ijrr_robust_single")),
+          FAILURES, by(in_depth, CLUTTER, "ijrr_robust_single")),
     Claim("a single mode runs into the elbow's bound and fails (2.6 s)", "[IJRR] 6.1",
-          FAILURES, hits_elbow(ARM, "ijrr_single_limits")),
+          FAILURES, by(hits_elbow, ARM, "ijrr_single_limits")),
     Claim("with limits alone the fist ends up in the body", "[IJRR] 6.1", FAILURES,
-          share(CLUTTER, "ijrr_single_limits", "deep_share", "a part more than 2 cm in another")),
+          by(share, CLUTTER, "ijrr_single_limits", "deep_share",
+             "a part more than 2 cm in another")),
     Claim("CSS with three modes tracks the arm without failure", "[IJRR] 6.1",
-          FAILURES, tracks(ARM, "ijrr_css")),
+          FAILURES, by(tracks, ARM, "ijrr_css")),
     Claim("CSS with seven modes tracks the body without failure", "[IJRR] 6.1",
-          FAILURES, tracks(CLUTTER, "ijrr_css")),
+          FAILURES, by(tracks, CLUTTER, "ijrr_css")),
     Claim("several modes appear mainly while the arm moves in depth", "[IJRR] 6.1",
-          FAILURES, multimodal(ARM, "ijrr_css")),
+          FAILURES, by(multimodal, ARM, "ijrr_css")),
     Claim("several modes appear over nearly the whole motion of the body", "[IJRR] 6.1, [RR] 6",
-          FAILURES, mostly_multimodal(CLUTTER, "ijrr_css")),
+          FAILURES, by(mostly_multimodal, CLUTTER, "ijrr_css")),
     Claim("least squares often converge to poses that no body can take", "[IJRR] 6.1", FAILURES,
-          share(CLUTTER, "ijrr_cham_rehg_ssd", "outside_share", "a joint beyond its limit")),
+          by(share, CLUTTER, "ijrr_cham_rehg_ssd", "outside_share", "a joint beyond its limit")),
     Claim("noise of the dynamics with least squares loses the body (0.5 s)", "[IJRR] 6.1",
-          FAILURES, fails(CLUTTER, "ijrr_cham_rehg_ssd")),
+          FAILURES, by(fails, CLUTTER, "ijrr_cham_rehg_ssd")),
     Claim("with robust costs it lasts longer", "[IJRR] 6.1",
-          FAILURES, outlasts(CLUTTER, "ijrr_cham_rehg", "ijrr_cham_rehg_ssd")),
-    Claim("and is lost, too (0.7 s)", "[IJRR] 6.1", FAILURES, fails(CLUTTER, "ijrr_cham_rehg")),
+          FAILURES, by(outlasts, CLUTTER, "ijrr_cham_rehg", "ijrr_cham_rehg_ssd")),
+    Claim("and is lost, too (0.7 s)", "[IJRR] 6.1", FAILURES, by(fails, CLUTTER, "ijrr_cham_rehg")),
     Claim("CONDENSATION has the same fault", "[IJRR] 6.1",
-          FAILURES, fails(CLUTTER, "ijrr_condensation")),
+          FAILURES, by(fails, CLUTTER, "ijrr_condensation")),
     Claim("noise wide enough in depth puts most samples where the cost is high", "[IJRR] 6.1, 9",
-          TABLE1, at_all_scales("median cost of raw samples, CSS to a ball", _raw_costs)),
+          TABLE1, by(at_all_scales, "median cost of raw samples, CSS to a ball", _raw_costs)),
     Claim("Gaussian single mode loses the body in the dark (0.5 s)", "[IJRR] 6.2",
-          FAILURES, fails(DARK, "ijrr_gaussian_single")),
+          FAILURES, by(fails, DARK, "ijrr_gaussian_single")),
     Claim("a robust single mode follows longer (1 s)", "[IJRR] 6.2",
-          FAILURES, outlasts(DARK, "ijrr_robust_single", "ijrr_gaussian_single")),
-    Claim("and misjudges the depth", "[IJRR] 6.2", FAILURES, in_depth(DARK, "ijrr_robust_single")),
-    Claim("and is lost in the turn", "[IJRR] 6.2", FAILURES, fails(DARK, "ijrr_robust_single")),
+          FAILURES, by(outlasts, DARK, "ijrr_robust_single", "ijrr_gaussian_single")),
+    Claim("and misjudges the depth", "[IJRR] 6.2",
+          FAILURES, by(in_depth, DARK, "ijrr_robust_single")),
+    Claim("and is lost in the turn", "[IJRR] 6.2", FAILURES, by(fails, DARK, "ijrr_robust_single")),
     Claim("several modes with limits alone converge to impossible poses at times", "[IJRR] 6.2",
           FAILURES,
-          share(DARK, "ijrr_css_limits", "deep_modes_share", "parts in parts, of all modes")),
-    Claim("with terminal consequences", "[IJRR] 6.2", FAILURES, fails(DARK, "ijrr_css_limits")),
+          by(share, DARK, "ijrr_css_limits", "deep_modes_share", "parts in parts, of all modes")),
+    Claim("with terminal consequences", "[IJRR] 6.2", FAILURES, by(fails, DARK, "ijrr_css_limits")),
     Claim("CSS with all constraints tracks the whole sequence", "[IJRR] 6.2",
-          FAILURES, tracks(DARK, "ijrr_css")),
+          FAILURES, by(tracks, DARK, "ijrr_css")),
     Claim("clavicles are essential for many motions of the arms", "[IJRR] 6.2",
-          VARIATIONS, varied("css", "clavicles at rest", better=False)),
+          VARIATIONS, by(varied, "css", "clavicles at rest", better=False)),
     Claim("CSS finds more minima than a ball of the same volume", "[IJRR] 4.2, 7",
-          TABLE1, at_all_scales("CSS to SS", _minima)),
+          TABLE1, by(at_all_scales, "CSS to SS", _minima)),
     Claim("CSS finds the few minima that SS finds", "[IJRR] 7",
-          TABLE1, at_all_scales("found by both", _shared)),
+          TABLE1, by(at_all_scales, "found by both", _shared)),
     Claim("SS's minima cost slightly less at the median", "[IJRR] 7", TABLE1, median_costs),
     Claim("descent lowers the cost of samples by far", "[IJRR] 7",
-          TABLE1, at_all_scales("medians of raw samples to minima, CSS", _descent)),
+          TABLE1, by(at_all_scales, "medians of raw samples to minima, CSS", _descent)),
     Claim("samples at the scale of the covariance fall back into the same minimum", "[IJRR] 4.2",
           TABLE1, falls_back),
     Claim("largest over smallest deviation is 350 for an arm (a third of it at least)",
-          "[IJRR] Fig. 5", SPECTRA, spectrum_of(("arm8",), "ratio", 350 / 3)),
+          "[IJRR] Fig. 5", SPECTRA, by(spectrum_of, ("arm8",), "ratio", 350 / 3)),
     Claim("largest over smallest deviation is 2000 for a body (a third of it at least)",
-          "[IJRR] Fig. 5", SPECTRA, spectrum_of(FULL_BODIES, "ratio", 2000 / 3)),
+          "[IJRR] Fig. 5", SPECTRA, by(spectrum_of, FULL_BODIES, "ratio", 2000 / 3)),
     Claim("noise alike in all directions fills 10^54 times the volume (two thirds of the power)",
-          "[IJRR] 1.1", SPECTRA, spectrum_of(FULL_BODIES, "volume", 36)),
+          "[IJRR] 1.1", SPECTRA, by(spectrum_of, FULL_BODIES, "volume", 36)),
     Claim("a joint limit displaces the minimum", "[IJRR] 4.1, [RR] 4.1", SLICES, slope_at_limit),
     Claim("several minima along uncertain directions at 0.8 and 0.9 s",
           "[IJRR] Fig. 7, [RR] Fig. 5", SLICES, several_minima),
     Claim("close to a mode the cost usually has a single peak", "[RR] 4.2",
-          SLICES, few_minima("close", 1.5)),
+          SLICES, by(few_minima, "close", 1.5)),
     Claim("at large scale there are few spurious minima", "[IJRR] Fig. 8, [RR] 4.2",
-          SLICES, few_minima("far", 3)),
+          SLICES, by(few_minima, "far", 3)),
     Claim("CSS is far better than noise of the dynamics (body before clutter)", "[IJRR] 9",
-          FAILURES, outlasts(CLUTTER, "ijrr_css", "ijrr_cham_rehg")),
+          FAILURES, by(outlasts, CLUTTER, "ijrr_css", "ijrr_cham_rehg")),
     Claim("CSS is far better than noise of the dynamics (body in the dark)", "[IJRR] 9",
-          FAILURES, outlasts(DARK, "ijrr_css", "ijrr_cham_rehg")),
+          FAILURES, by(outlasts, DARK, "ijrr_css", "ijrr_cham_rehg")),
     Claim("weighing contours by foreground and motion boundaries improves much", "[IJRR] 8",
           FAILURES, weights_help),
     Claim("stabilisers hold what is hard to estimate", "[IJRR] 3.2.2, 6.2",
-          VARIATIONS, varied("css", "no stabilisers", better=False)),
+          VARIATIONS, by(varied, "css", "no stabilisers", better=False)),
     Claim("more modes and samples follow what was lost", "[IJRR] 8",
-          VARIATIONS, varied("ijrr_css", "three times", better=True)),
+          VARIATIONS, by(varied, "ijrr_css", "three times", better=True)),
     Claim("three hypotheses track the arm over the whole sequence", "[RR] 6",
-          FAILURES, tracks(ARM7, "rr_multiple_hypothesis")),
+          FAILURES, by(tracks, ARM7, "rr_multiple_hypothesis")),
     Claim("seven hypotheses track the body over the whole sequence", "[RR] 6",
-          FAILURES, tracks(CLUTTER, "rr_multiple_hypothesis")),
+          FAILURES, by(tracks, CLUTTER, "rr_multiple_hypothesis")),
     Claim("edges alone are enough to score hypotheses", "[RR] 4.2", SCORES, edges_suffice),
     Claim("a pattern along uncertain directions finds more than as many hypotheses at random",
           "[RR] 4.2", SCORES, pattern_helps),
     Claim("motion boundaries tell the arm from the pillar", "[RR] 3.2, 6", VARIATIONS,
-          varied("rr_multiple_hypothesis", "no motion boundaries", better=False)),
+          by(varied, "rr_multiple_hypothesis", "no motion boundaries", better=False)),
     Claim("an imperfect model of the arm is tolerated", "[RR] 6, [IJRR] 6.1", VARIATIONS,
-          tolerated("rr_multiple_hypothesis", "long arms", "short arms")),
+          by(tolerated, "rr_multiple_hypothesis", "long arms", "short arms")),
     Claim("joint limits make the first pose more stable", "[IJRR] 5, [RR] 5",
-          FIRST, steadier("without limits")),
-    Claim("so do prior lengths", "[IJRR] 5, [RR] 5", FIRST, steadier("no prior on lengths")),
+          FIRST, by(steadier, "without limits")),
+    Claim("so do prior lengths", "[IJRR] 5, [RR] 5", FIRST, by(steadier, "no prior on lengths")),
     Claim("so does that left and right are equal", "[IJRR] 5, [RR] 5",
-          FIRST, steadier("sides free", "sides equal")),
+          FIRST, by(steadier, "sides free", "sides equal")),
     Claim("an arm takes 10 s a frame, a body 4 minutes, most of it for the cost", "[RR] 6",
-          "profile_step.py", untested(SPEED)),
+          "profile_step.py", by(untested, SPEED)),
 )  # fmt: skip
 """All of them, in the papers' order."""
 

@@ -123,13 +123,13 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
     )  # fmt: skip
     evidence = script.read_evidence(script.Config(failures=(path,), sequences=(folder,)))
     assert name in evidence.depth
-    seen = script.multimodal("arm", "ijrr_css")(replace(evidence, depth={"arm": depth}))
+    seen = script.multimodal(replace(evidence, depth={"arm": depth}), "arm", "ijrr_css")
     assert seen.holds
     assert "0.90 in the half" in seen.words
-    assert not script.mostly_multimodal("arm", "ijrr_css")(evidence).holds
+    assert not script.mostly_multimodal(evidence, "arm", "ijrr_css").holds
     run["per_frame"]["apart_weight"] = [0.0, 0.5, 0.5]
     evidence.runs["arm"]["ijrr_css"][:] = [run]
-    assert script.mostly_multimodal("arm", "ijrr_css")(evidence).holds
+    assert script.mostly_multimodal(evidence, "arm", "ijrr_css").holds
 
 
 def test_weights_help_where_the_error_is_less(script: ModuleType, tmp_path: Path) -> None:
