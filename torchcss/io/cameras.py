@@ -148,7 +148,7 @@ def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
     lens = None if distortion is None else _five(distortion.ravel(), where)
     try:
         return Camera(
-            K.reshape(3, 3) if K.shape == (9,) else K,
+            K,
             (int(size[0]), int(size[1])),
             distortion=lens,
             R_camera_world=rotation,

@@ -899,7 +899,7 @@ def test_names_that_a_file_says_win_over_their_number(tmp_path: Path, key: str) 
     where = ("l_wrist", "r_ankle", "l_hip")
     check(read(write(tmp_path / "a.json", {key: names, "frames": frames})), names=where)
     array = np.stack([person(t, layout) for t in SEEN])
-    np.savez(tmp_path / "a.npz", keypoints=array, frames=SEEN, **{key: np.array(names, "S")})
+    np.savez(tmp_path / "a.npz", keypoints=array, frame=SEEN, **{key: np.array(names, "S")})
     check(read(tmp_path / "a.npz"), (3,), names=where)
 
 

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from torchcss.errors import KeypointError
-from torchcss.files import load_arrays, shortened
+from torchcss.files import load_arrays, shortened, unexpected
 from torchcss.io.keypoints.frames import FRAMES_AT_MOST
-from torchcss.io.keypoints.mediapipe import is_landmark_array, read_landmark_array
+from torchcss.io.keypoints.mediapipe import LAYOUT, is_landmark_array, landmark_places
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
     Frames,
@@ -54,30 +54,25 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     alone = len(arrays) == 1
     name = next(iter(arrays)) if alone else first_of({key: key for key in numbers}, _PLACES)
     array, counts = _numbered(arrays.get(name or "", np.zeros(0)))
-    if alone and is_landmark_array(array):
-        return read_landmark_array(name or "", array)
     if name is None:
-        raise KeypointError(
-            f"expected the arrays keypoints, confidence and joint_names, "
-            f"found {shortened(', '.join(arrays) or 'none')}"
+        raise unexpected(
+            KeypointError, "", "the arrays keypoints, confidence and joint_names", list(arrays)
         )
-    report = [f"format: {path.suffix[1:].upper()}"]
-    values = _people(name, array)
-    from_movenet = is_movenet(array, alone=alone)
+    kind = path.suffix[1:].upper()
+    if landmarks := alone and is_landmark_array(array):
+        values, kind = landmark_places(array)[:, None], f"MediaPipe landmarks, array {name}"
+    else:
+        values = _people(name, array)
+    if from_movenet := not landmarks and is_movenet(array, alone=alone):
+        values, kind = (
+            values[..., [1, 0, 2]],
+            "MoveNet's arrays, y before x, fractions of the image",
+        )
+    report = [f"format: {kind}"]
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
-    if from_movenet:
-        values = values[..., [1, 0, 2]]
-        report = ["format: MoveNet's arrays, y before x, fractions of the image"]
-    if (given := first_of(arrays, SCORES)) is not None:
-        confidence = _confidence(given, values.shape[:3])
-        values = np.concatenate([values[..., :2], confidence[..., None]], -1)
-    elif values.shape[-1] == 2:
-        report.append("no confidence in the file: 1 for every joint that is a number")
-        values = screened(np.where(np.isfinite(values), values, np.nan))
-    else:
-        report.append(f"confidence: the third numbers of {name}")
+    values, told = _with_confidence(name, values, first_of(arrays, SCORES))
     tracks = _tracks(arrays.get("person_ids"), values.shape[1])
     people = [
         [
@@ -91,10 +86,11 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     noise = _positive("relative_noise", arrays.get("relative_noise"), 1)
     texts = {key: each for key, each in texts.items() if each.shape == values.shape[2:3]}
     return People(
-        _counted(people, first_of({**numbers, "frame": counts}, FRAMES)),
+        _counted(people, first_of(numbers, FRAMES) if counts is None else counts),
         _names(arrays.get("joint_names", first_of(texts, ORDER_NAMES)), values.shape[2]),
-        report,
-        corner_fractions=from_movenet,
+        [*report, told],
+        LAYOUT if landmarks else None,
+        corner_fractions=from_movenet or landmarks,
         size_wh=None if size is None else (size[0], size[1]),
         relative_noise=noise[0] if noise else 1.0,
     )
@@ -192,29 +188,32 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
             values = values[..., [0, 1, 3]]
         elif len(shape) == 3 and shape[1] in (2, 3) and shape[2] in LAYOUT_SIZES:
             values = values.swapaxes(1, 2)
-        shape = values.shape
-        if len(shape) == 2 and shape[1] in (2, 3) and shape[0] in LAYOUT_SIZES:
-            return values[None, None]
-        if len(shape) == 2:
-            size = next(
-                (n for n in (3, 2) if shape[1] % n == 0 and shape[1] // n in LAYOUT_SIZES), 0
-            )
-            if size:
-                return values.reshape(shape[0], 1, -1, size)
-        if len(shape) == 3 and shape[2] in (2, 3):
-            return values[:, None]
-        if len(shape) == 4 and shape[3] in (2, 3):
-            return values
-        if len(shape) == 5 and tuple(shape[1:3]) == (1, 1) and shape[4] == 3:
-            return values[:, 0]
+        elif len(shape) == 2 and shape[1] in (2, 3) and shape[0] in LAYOUT_SIZES:
+            values = values[None]
+        elif len(shape) == 2:
+            sizes = (n for n in (3, 2) if shape[1] % n == 0 and shape[1] // n in LAYOUT_SIZES)
+            values = values.reshape(shape[0], -1, next(sizes, shape[1]))
+        elif len(shape) == 5 and shape[1] == 1:
+            values = values[:, 0]
+        if values.ndim in (3, 4) and values.shape[-1] in (2, 3):
+            return values.reshape(len(values), -1, *values.shape[-2:])
     expected = "numbers [frames, joints, 2 or 3] or [frames, people, joints, 2 or 3]"
     raise _unfit(name, array, expected)
 
 
-def _confidence(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    if array.dtype.kind not in "biuf" or array.size != math.prod(shape):
-        raise _unfit("confidence", array, f"numbers {[n for n in shape if n != 1]}")
-    return array.astype(np.float64).reshape(shape)
+def _with_confidence(
+    name: str, values: np.ndarray, given: np.ndarray | None
+) -> tuple[np.ndarray, str]:
+    """`[t p j 3]`, and where the confidences are from."""
+    if given is None and values.shape[-1] == 2:
+        told = "no confidence in the file: 1 for every joint that is a number"
+        return screened(np.where(np.isfinite(values), values, np.nan)), told
+    if given is None:
+        return values, f"confidence: the third numbers of {name}"
+    if given.dtype.kind not in "biuf" or given.size != math.prod(values.shape[:3]):
+        raise _unfit("confidence", given, f"numbers {[n for n in values.shape[:3] if n != 1]}")
+    given = given.astype(np.float64).reshape(*values.shape[:3], 1)
+    return np.concatenate([values[..., :2], given], -1), "confidence: beside the joints"
 
 
 def _names(names: np.ndarray | None, num_joints: int) -> Names | None:

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchcss.errors import KeypointError
-from torchcss.files import real_numbers, shortened, unexpected
-from torchcss.io.keypoints.json_people import JOINTS, PEOPLE
-from torchcss.io.keypoints.people import Frames, People, Person, Size, united
+from torchcss.files import shortened, unexpected
+from torchcss.io.keypoints.json_people import JOINTS, PEOPLE, one_person
+from torchcss.io.keypoints.people import Frames, People, Size, united
 
 
 def is_clicked(content: Mapping[str, Any]) -> bool:
@@ -44,24 +44,13 @@ def read_clicked(content: Mapping[str, Any], image_size_wh: Size) -> People:
     for key, joints in frames.items():
         if not re.fullmatch(r"[0-9]{1,6}", key):
             raise unexpected(KeypointError, "", "a frame number", key)
-        named = _clicked_joints(f"frame {key}", joints)
-        clicked[int(key)] = [Person.by_name(named)] if named else []
+        joints = joints.get("joints", joints) if isinstance(joints, dict) else joints
+        if not isinstance(joints, dict):
+            raise unexpected(KeypointError, f"frame {key}", "joints by name", joints)
+        rows = {
+            name: [*place, 1.0] if isinstance(place, list) and len(place) == 2 else place
+            for name, place in joints.items()
+        }
+        clicked[int(key)] = one_person(f"frame {key}", rows) if rows else []
     found, names = united(clicked)
     return People(found, names, ["format: clicked joints"], first=0, by_hand=True)
-
-
-def _clicked_joints(where: str, joints: object) -> dict[str, list[float]]:
-    """u, v and confidence of the joints of a frame, by name."""
-    if isinstance(joints, dict) and isinstance(joints.get("joints"), dict):
-        joints = joints["joints"]
-    if not isinstance(joints, dict):
-        raise unexpected(KeypointError, where, "joints by name", joints)
-    found = {}
-    for name, place in joints.items():
-        values = real_numbers(place, f"{where}: {name}", KeypointError)
-        if values.shape not in ((2,), (3,)):
-            raise KeypointError(
-                f"{where}: {name}: expected [u, v] or [u, v, confidence], found {shortened(place)}"
-            )
-        found[name] = [*values.tolist(), 1.0][:3]
-    return found

@@ -16,7 +16,6 @@ import io
 import math
 import pickle
 import zipfile
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -82,12 +81,8 @@ class PlainUnpickler(pickle.Unpickler):
 def is_h36m(path: Path) -> bool:
     """Whether a file is such an archive."""
     names = _names(path)
-    if "positions_2d.npy" in names or not {"boxes.npy", "keypoints.npy"} <= names:
-        return "positions_2d.npy" in names
-    with suppress(Exception), zipfile.ZipFile(path) as archive, archive.open("boxes.npy") as stream:
-        header = array_header(stream)
-        return header is not None and header[1].hasobject
-    return False
+    detected = {"boxes.npy", "keypoints.npy", "metadata.npy"}
+    return "positions_2d.npy" in names or detected <= names
 
 
 def _names(path: Path) -> set[str]:

@@ -17,8 +17,9 @@ import numpy as np
 
 from torchcss.errors import KeypointError, optional_package
 from torchcss.files import read_bytes, refusing
+from torchcss.io.keypoints.arrays import read_arrays
 from torchcss.io.keypoints.h36m import PlainUnpickler
-from torchcss.io.keypoints.people import Frames, People, Person, screened
+from torchcss.io.keypoints.people import People
 from torchcss.io.keypoints.tables import people_of_rows
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -87,23 +88,17 @@ def _read_sleap(path: Path, file: Any) -> People:
             f"{list(points.shape)}"
         )
     points = points.transpose(3, 0, 2, 1)
-    scores = None
+    # From the video's first frame to the last one with somebody.
+    arrays = {"keypoints": points, "joint_names": np.array(names), "frame": np.arange(len(points))}
     if "point_scores" in file:
         scores = _array(path, file["point_scores"]).astype(np.float64)
         scores = scores if is_turned else scores.transpose(2, 0, 1)
+        arrays["scores"] = np.where(np.isfinite(points).all(-1), scores, 0.0)
     tracks = _texts(path, file["track_names"]) if "track_names" in file else []
-    found = screened(points, scores)
-    # From the video's first frame to the last one with somebody.
-    frames: Frames = {
-        place: [
-            Person(joints, tracks[index] if index < len(tracks) else None)
-            for index, joints in enumerate(people)
-            if (joints[:, 2] > 0).any()
-        ]
-        for place, people in enumerate(found)
-    }
+    if len(tracks) == points.shape[1]:
+        arrays["person_ids"] = np.array(tracks)
     report = [f"format: SLEAP's analysis, {len(points[0])} tracks"]
-    return People(frames, tuple(names), report, first=0)
+    return read_arrays(path, arrays)._replace(report=report, first=0)
 
 
 def _read_pandas(path: Path, group: Any) -> People:

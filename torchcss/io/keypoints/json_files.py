@@ -21,12 +21,7 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_json, read_text, shortened, unexpected
-from torchcss.io.keypoints.annotated import (
-    is_label_studio,
-    is_via,
-    read_label_studio,
-    read_via,
-)
+from torchcss.io.keypoints import annotated
 from torchcss.io.keypoints.arrays import is_movenet, read_arrays
 from torchcss.io.keypoints.clicked import is_clicked, read_clicked
 from torchcss.io.keypoints.coco import read_coco
@@ -88,13 +83,13 @@ def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People
     content = _load(path)
     if (array := _plain_array(content)) is not None and is_movenet(array):
         return read_arrays(path, {path.name: array})
-    if is_label_studio(content):
-        return read_label_studio(content)
+    if annotated.is_label_studio(content):
+        return annotated.read_label_studio(content)
     if (rows := rows_of_json(content)) is not None:
         return people_of_rows(rows)
     if isinstance(content, dict):
-        if is_via(content):
-            return read_via(content)
+        if annotated.is_via(content):
+            return annotated.read_via(content)
         if "annotations" in content:
             return read_coco(content)
         if "skeleton" in content and isinstance(content.get("keypoints"), list):

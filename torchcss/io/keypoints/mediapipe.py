@@ -18,10 +18,7 @@ from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
     Frames,
     Names,
-    People,
-    Person,
     joint_counts,
-    screened,
 )
 from torchcss.joint_names import ALIASES, names_in
 
@@ -92,21 +89,12 @@ def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
     return found
 
 
-def read_landmark_array(name: str, array: np.ndarray) -> People:
-    """Read an array of landmarks, if it is one (see `is_landmark_array`)."""
+def landmark_places(array: np.ndarray) -> np.ndarray:
+    """x, y and visibility, if there is one, of an array of landmarks (see `is_landmark_array`)."""
     if array.shape[1:] == (_HOLISTIC,):
         array = array[:, : 4 * NUM_LANDMARKS]
-    size = array.shape[-1] if array.ndim == 3 else array.shape[-1] // NUM_LANDMARKS
-    values = array.astype(np.float64).reshape(len(array), NUM_LANDMARKS, size)
-    seen = np.isfinite(values[..., :2]).all(-1) & (values[..., :2] != 0).any(-1)
-    places = np.where(seen[..., None], values[..., :2], np.nan)
-    found = screened(places, values[..., 3] if size == 4 else None)
-    report = [f"format: MediaPipe landmarks, array {name}"]
-    if size == 3:
-        report.append(
-            "three numbers per landmark taken as x, y, z: confidence 1 where there is one"
-        )
-    return People([[Person(each)] for each in found], None, report, LAYOUT, corner_fractions=True)
+    values = array.astype(np.float64).reshape(len(array), NUM_LANDMARKS, -1)
+    return values[..., [0, 1, 3]] if values.shape[2] == 4 else values[..., :2]
 
 
 def is_landmark_array(array: np.ndarray) -> bool:
