@@ -12,7 +12,8 @@ from torch import Tensor
 from torchcss.body.catalog import BODY_NAMES
 from torchcss.body.lift import lift_to_joints
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.cost.term import differentiate_twice
 from torchcss.types import Curvature, PointCost
 
 NUM_POINTS = 30

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, specification
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel, differentiate_twice
+from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
+from torchcss.cost.term import differentiate_twice
 from torchcss.errors import BodyError, ConfigurationError, ShapeError
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS
 

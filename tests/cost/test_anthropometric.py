@@ -11,8 +11,9 @@ from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, PROPORTIONS, specification
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel, differentiate_twice
+from torchcss.body.model import BodyModel
 from torchcss.cost.anthropometric import INDIVIDUAL, Anthropometric, proportion_columns
+from torchcss.cost.term import differentiate_twice
 from torchcss.initialise.multi_start import PAPER_PROPORTIONS, StartSearch
 from torchcss.types import LocalModel
 

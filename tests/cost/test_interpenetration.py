@@ -13,10 +13,11 @@ from reference import kinematics
 from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel, differentiate_twice
+from torchcss.body.model import BodyModel
 from torchcss.body.surface import implicit, surface_points
 from torchcss.cost.interpenetration import END, Interpenetration, InterpenetrationPairs, NearNodes
 from torchcss.cost.joints import JointTerm, match_joints
+from torchcss.cost.term import differentiate_twice
 from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Curvature, Keypoints, LocalModel

@@ -17,10 +17,10 @@ from made_costs import (
 )
 from torch import Tensor
 
-from torchcss.body.model import differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm, match_joints
+from torchcss.cost.term import differentiate_twice
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.initialise.view import CameraView
 from torchcss.types import Keypoints

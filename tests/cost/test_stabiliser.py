@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import differentiate_twice
 from torchcss.cost.stabiliser import Stabiliser, long_tailed
+from torchcss.cost.term import differentiate_twice
 
 
 def by_hand(x: Tensor, centre: Tensor, deviation: Tensor, nu: float) -> Tensor:

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import differentiate_twice
 from torchcss.cost.targets import ARM, PointTargets, pose_targets
+from torchcss.cost.term import differentiate_twice
 from torchcss.errors import BodyError, ShapeError
 from torchcss.solve.inverse_kinematics import link_pose
 

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from torchcss.body.model import differentiate_twice
 from torchcss.cost.stabiliser import long_tailed
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
+from torchcss.cost.term import differentiate_twice
 from torchcss.inference.dynamics import Diffusion
 from torchcss.inference.mixture import GaussianMixture
 

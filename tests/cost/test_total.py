@@ -24,7 +24,6 @@ from reference.contour import cost_of_fixed_matches
 from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import differentiate_twice
 from torchcss.cost import total
 from torchcss.cost.anthropometric import Anthropometric, proportion_columns
 from torchcss.cost.choice import CostChoice
@@ -34,6 +33,7 @@ from torchcss.cost.frame import FrameCosts
 from torchcss.cost.fused import engine_for
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.term import differentiate_twice
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.errors import ShapeError

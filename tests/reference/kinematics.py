@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchcss.body.chain import JointSpecification
 from torchcss.body.kinematics import TreePose
-from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
+from torchcss.body.model import BodyModel, BodyPose
+from torchcss.cost.term import differentiate_twice
 from torchcss.types import LocalModel, PointCost
 
 

@@ -12,9 +12,10 @@ import torch
 
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
-from torchcss.body.model import BodyModel, differentiate_twice
+from torchcss.body.model import BodyModel
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.targets import PointDistances
+from torchcss.cost.term import differentiate_twice
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
     LIMB_JOINTS,

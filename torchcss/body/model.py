@@ -424,21 +424,3 @@ def _driver(joint: str, mimics: Mapping[str, tuple[str, float, float]]) -> tuple
         driver, step, shift = mimics[driver]
         factor, offset = factor * step, offset + factor * shift
     raise BodyError(f"joint {joint!r} mimics {driver!r}, which mimics it in turn")
-
-
-def differentiate_twice(value: Float[Tensor, "*batch"], x: Float[Tensor, "*batch n"]) -> LocalModel:
-    """Gradient and Hessian of a batch of scalars by double backward, one row at a time.
-
-    Args:
-        value: Scalars that depend on `x`, item by item.
-        x: The leaf to differentiate with respect to.
-    """
-    (gradient,) = torch.autograd.grad(value.sum(), x, create_graph=True)
-    rows = [
-        torch.autograd.grad(gradient[..., i].sum(), x, retain_graph=True, allow_unused=True)[0]
-        if gradient.requires_grad
-        else None
-        for i in range(x.shape[-1])
-    ]
-    hessian = torch.stack([torch.zeros_like(x) if row is None else row for row in rows], dim=-2)
-    return LocalModel(value.detach(), gradient.detach(), hessian.detach())

@@ -260,16 +260,26 @@ class OnStates:
         return self.model(posed, curvature)
 
 
+def differentiate_twice(value: Float[Tensor, "*batch"], x: Float[Tensor, "*batch n"]) -> LocalModel:
+    """Gradient and Hessian of a batch of scalars by double backward, one row at a time.
+
+    Args:
+        value: Scalars that depend on `x`, item by item.
+        x: The leaf to differentiate with respect to.
+    """
+    (gradient,) = torch.autograd.grad(value.sum(), x, create_graph=True)
+    rows = [
+        torch.autograd.grad(gradient[..., i].sum(), x, retain_graph=True, allow_unused=True)[0]
+        if gradient.requires_grad
+        else None
+        for i in range(x.shape[-1])
+    ]
+    hessian = torch.stack([torch.zeros_like(x) if row is None else row for row in rows], dim=-2)
+    return LocalModel(value.detach(), gradient.detach(), hessian.detach())
+
+
 def differentiated(term: BoundImage, posed: Posed) -> PointCost:
     """Value and derivatives of a bound term by autograd, each point in its own position."""
     with torch.enable_grad():
         at = term.points(posed).detach().requires_grad_()
-        value = term.value(posed, at)
-        (gradient,) = torch.autograd.grad(value.sum(), at, create_graph=True)
-        rows = [
-            torch.autograd.grad(part.sum(), at, retain_graph=True, materialize_grads=True)[0]
-            for part in gradient.unbind(-1)
-            if part.requires_grad
-        ]
-    hessian = torch.stack(rows, dim=-2) if rows else at.new_zeros(*at.shape, 3)
-    return PointCost(value.detach(), gradient.detach(), hessian.detach())
+        return PointCost(*differentiate_twice(term.value(posed, at), at))

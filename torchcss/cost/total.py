@@ -45,10 +45,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
-from torchcss.body.model import BodyModel, BodyPose, differentiate_twice
+from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
-from torchcss.cost.term import BoundImage, Kind, Posed, Term
+from torchcss.cost.term import BoundImage, Kind, Posed, Term, differentiate_twice
 from torchcss.errors import ShapeError
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.problem import SearchProblem

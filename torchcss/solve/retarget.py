@@ -7,7 +7,7 @@ shoulders, elbows and wrists. A body is therefore fitted to where these are, fra
    % of the standard humanoid (section 3.2.3 [IJRR]). Where that holds a length, the joints keep
    their directions and take the body's: else narrow shoulders, which many skeletons of recordings
    have, would be clavicles bent back to their limits.
-2. *Trajectory*, from several starting poses per frame, all in one batch of the bound-constrained
+2. *States*, from several starting poses per frame, all in one batch of the bound-constrained
    search of section 4.1 [IJRR]: squared distances in space and the sticky prior of section 3.2.2
    on what the joints do not tell (the twist of a straight arm).
 3. *One path* through the poses found in every frame, that of least cost and motion, and
@@ -468,7 +468,7 @@ def _fit(
     choice: Retargeting,
     generator: torch.Generator,
 ) -> Trajectory:
-    """Trajectory of all frames: several descents each, the best path through them, smoothing."""
+    """States of all frames: several descents each, the best path through them, smoothing."""
     body, frames, k = cost.body, len(root), choice.num_starts
     bounds = free_turns(body)
     noise = torch.randn(k, body.num_parameters, generator=generator, dtype=body.dtype)

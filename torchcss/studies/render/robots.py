@@ -211,7 +211,7 @@ def stand(body: BodyModel) -> Vector:
 
 
 def trot(body: BodyModel, times: Float[Tensor, " t"]) -> Trajectory:
-    """Trajectory of a quadruped that trots forwards, turning slowly to its left.
+    """States of a quadruped that trots forwards, turning slowly to its left.
 
     Args:
         body: ANYmal on a free root, or another one whose legs have the joints `LF_HAA` (sideways),

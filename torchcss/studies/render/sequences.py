@@ -83,7 +83,7 @@ class SyntheticSequence:
 
 
 def arm_motion(body: BodyModel, times: Float[Tensor, " t"]) -> Trajectory:
-    """Trajectory of arm8 that bend, rotate and reach towards the camera.
+    """States of arm8 that bend, rotate and reach towards the camera.
 
     Args:
         body: An arm.
