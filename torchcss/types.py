@@ -132,22 +132,15 @@ class Status(IntEnum):
     """Why the optimiser stopped on one item."""
 
     RUNNING = 0
+    """It has not."""
     CONVERGED = 1
+    """A Newton step promises to lower the cost by less than the tolerance."""
     SMALL_STEP = 2
+    """Short steps lower the cost by less than that, as where it jumps or has a kink."""
     STEP_LIMIT = 3
+    """There were `max_steps`."""
     NON_FINITE = 4
-
-    @property
-    def message(self) -> str:
-        """What happened and what to try."""
-        return {
-            Status.RUNNING: "still running",
-            Status.CONVERGED: "a Newton step promises to lower the cost by less than the tolerance",
-            Status.SMALL_STEP: "short steps lower the cost by less than the tolerance, as where it "
-            "jumps or has a kink; use float64 if the gradient matters",
-            Status.STEP_LIMIT: "the step limit was reached; raise max_steps",
-            Status.NON_FINITE: "the cost is not finite at the start; check the input",
-        }[self]
+    """The cost is not finite at the start."""
 
 
 class Modes(NamedTuple):

@@ -114,7 +114,8 @@ def test_another_girth_is_found(by: str, thicker: float, least: float):
         row = body.part_names.index(part)
         grown = float(shape[row, :2].sum() / body.part_shape[row, :2].sum() - 1)
         assert least < grown / thicker < 1.5
-    whole = TrustRegionNewton(max_steps=10, tolerance=1e-2).minimise(cost, fit.mean, cost.bounds)
+    limits = Bounds(*map(torch.cat, zip(body.bounds, parameters.bounds, strict=True)))
+    whole = TrustRegionNewton(max_steps=10, tolerance=1e-2).minimise(cost, fit.mean, limits)
     assert float(whole.cost[0]) <= float(fit.cost[0])
 
 

@@ -24,7 +24,7 @@ from torchcss.body.shape import ShapeParameters, lift_with_shape, surface_angles
 from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.types import Bounds, LocalModel, PointCost, frozen
+from torchcss.types import LocalModel, PointCost, frozen
 
 
 class Outline(NamedTuple):
@@ -54,12 +54,6 @@ class ShapedCost:
     base: TrackingCost
     parameters: ShapeParameters
     outlines: tuple[Outline, ...]
-
-    @property
-    def bounds(self) -> Bounds:
-        """Limits of state and shape."""
-        pairs = zip(self.base.body.bounds, self.parameters.bounds, strict=True)
-        return Bounds(*(torch.cat(pair) for pair in pairs))
 
     def take(self, items: Int[Tensor, " b"]) -> ShapedCost:
         """The cost of some of the items: the same for all."""
