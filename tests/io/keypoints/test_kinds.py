@@ -475,6 +475,18 @@ def test_wrists_behind_their_fingers(tmp_path: Path, layout: str) -> None:
     check(read(tmp_path / "a.npy"))
 
 
+@pytest.mark.parametrize("name", ["H36M-17", "H36M-16"])
+def test_human36m_is_told_by_its_middles(tmp_path: Path, name: str) -> None:
+    layout = ALIASES[name]
+    frames = np.stack([person(t, layout) for t in T])
+    frames[:, 7, :2] = frames[:, [0, 8], :2].mean(1)  # the spine
+    np.save(tmp_path / "a.npy", frames)
+    found = read(tmp_path / "a.npy")
+    check(found, names=("l_wrist", "r_ankle", "l_hip"))
+    told = f"{name}, by its {name[-2:]} joints, of which 0 is the middle of 1 and 4"
+    assert any(told in line for line in found.report)
+
+
 def test_a_column_that_counts_the_rows(tmp_path: Path) -> None:
     rows = np.stack([[t, *person(t).flat] for t in T])  # 52 numbers: not 26 pairs
     np.save(tmp_path / "a.npy", rows)

@@ -471,7 +471,7 @@ def check_error(path: Path, match: str, **options) -> None:
         ("CHANNELS 3 Xrotation", "CHANNELS three Xrotation", "line 9: expected a number"),
         ("CHANNELS 3 Xrotation", "CHANNELS 3 Zrotation", "line 9: expected every channel once"),
         ("CHANNELS 3 Xrotation", "CHANNELS 3 Wrotation", "line 9: expected Xposition"),
-        ("End Site", "End", "line 11: expected SITE"),
+        ("End Site", "End", "line 11: expected a name"),
         ("MOTION", "}", "line 25: expected MOTION"),
         ("Frames: 2", "Frames: 3", "3 frames, as Frames: says"),
         ("Frames: 2", "Frames: 1", "1 frames, as Frames: says"),

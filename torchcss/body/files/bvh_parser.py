@@ -174,8 +174,7 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
             continue
         parent = stack[-1] if stack else -1
         if kind == "END":
-            words.keyword("SITE")
-            words.keyword("{")
+            words.name()  # Site, and what some programs call it
             name = f"{segments[parent].name}_end"
             name = f"{name}{len(segments)}" if name in names else name
             names.add(name)

@@ -521,22 +521,31 @@ def _names_of_people(
     )
 
 
+_MIDDLES = {
+    "BODY_25": ((8, 9, 12),), "BODY_18": ((8, 9, 12),),
+    "H36M-17": ((0, 1, 4), (7, 0, 8), (8, 11, 14)),
+    "H36M-16": ((0, 1, 4), (7, 0, 8), (8, 10, 13)),
+}  # fmt: skip
+"""Joints of layouts that stand in the middle of two others: hips, and spine and shoulders."""
+
+
 def _recognise(chosen: np.ndarray) -> tuple[str, str]:
     """Return the layout of unnamed joints and why."""
     candidates = _LAYOUTS_BY_COUNT[chosen.shape[1]]
     if len(candidates) == 1:
         return candidates[0], f"by its {chosen.shape[1]} joints"
-    pair = {25: ("BODY_25", "BODY_25B"), 18: ("BODY_18", "COCO-18")}.get(chosen.shape[1])
-    if pair is not None:
-        # In OpenPose's order joint 8 is computed as the middle of the hips, 9 and 12.
-        seen = (chosen[:, [8, 9, 12], 2] > 0.0).all(axis=1)
-        if seen.any():
-            gap = chosen[:, 8, :2] - 0.5 * (chosen[:, 9, :2] + chosen[:, 12, :2])
-            sizes = np.array([size_of(person) for person in chosen])
-            share = float(np.median((np.linalg.norm(gap, axis=1) / sizes)[seen]))
-            layout, where = (pair[0], "is") if share < 0.08 else (pair[1], "is not")
-            return layout, (
-                f"by its {chosen.shape[1]} joints, of which 8 {where} the middle of 9 and 12"
-            )
+    for layout, middles in _MIDDLES.items():
+        columns = np.array(middles)
+        seen = chosen[(chosen[:, columns.ravel() % chosen.shape[1], 2] > 0.0).all(axis=1)]
+        if layout not in candidates or not len(seen):
+            continue
+        places, size = seen[:, columns, :2], np.array([[size_of(person)] for person in seen])
+        gaps = np.linalg.norm(places[:, :, 0] - places[:, :, 1:].mean(2), axis=-1) / size
+        is_it, (at, one, other) = (np.median(gaps, axis=0) < 0.08).all(), middles[0]
+        if not is_it and layout[:4] == "H36M":  # nor need it be the other one
+            continue
+        layout = layout if is_it else next(each for each in candidates if each != layout)
+        why = f"of which {at} is {'' if is_it else 'not '}the middle of {one} and {other}"
+        return layout, f"by its {chosen.shape[1]} joints, {why}"
     others = ", ".join(candidates[1:])
     return candidates[0], f"by its {chosen.shape[1]} joints ({others} has as many: set layout)"
