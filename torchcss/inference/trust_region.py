@@ -213,6 +213,13 @@ class TrustRegionNewton:
             The next state, and what became of the steps. Of an item that is not finite at the
             start, the state has `Status.NON_FINITE` and the start as given.
         """
+        fields = [f.clone(memory_format=torch.contiguous_format) for f in state.tensors]
+        return self._step(cost, TrustRegionState.of(fields), bounds, scale)
+
+    def _step(
+        self, cost: CostFunction, state: TrustRegionState, bounds: Bounds, scale: Vector | None
+    ) -> tuple[TrustRegionState, TrustRegionInfo]:
+        """The same from a state whose memory is nobody else's: it may become the next one's."""
         bounds, weight = bounds.to(state.x), state.x.new_ones(state.x.shape[-1])
         if scale is not None:
             weight = scale.to(state.x).square().reciprocal()
@@ -229,14 +236,13 @@ class TrustRegionNewton:
         bounds: Bounds,
         weight: Vector,
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
-        """The same as `_advance` in one compiled call."""
+        """The same as `_advance` in one compiled call, and in the memory of the state."""
         from torchcss.inference import planning  # compiled: only where it is used
 
-        fields = [f.clone(memory_format=torch.contiguous_format) for f in state.tensors]
         info = TrustRegionInfo(
             torch.empty_like(state.status, dtype=torch.bool), torch.empty_like(state.radius)
         )
-        arrays = [_array(field) for field in fields]
+        arrays = [_array(field) for field in state.tensors]
         real: Any = np.float32 if state.x.dtype == torch.float32 else np.float64
         run(
             planning.advance,
@@ -252,7 +258,7 @@ class TrustRegionNewton:
             planning.make_memory(state.x.shape[-1], real),
             *map(_array, info),
         )
-        return TrustRegionState.of(fields), info
+        return state, info
 
     def _advance(
         self,
@@ -370,7 +376,7 @@ class TrustRegionNewton:
         pool = result.take(items)
         part = cost if len(items) == len(status) else cost.take(items)
         while len(items):
-            pool, _ = self.step(part, pool, bounds, scale=scale)
+            pool, _ = self._step(part, pool, bounds, scale)
             running = pool.status == Status.RUNNING
             if bool(running.all()):
                 continue
