@@ -14,7 +14,7 @@ from torchcss.studies.render.sequences import SyntheticSequence
 OBSERVED = 12
 """Waits of the host while the features of a frame are made."""
 
-STEPPED = {"arm": 620, "person": 800}
+STEPPED = {"arm": 610, "person": 750}
 """Waits of the host in the step of a frame, in the mean over seeds, which differ by a third: 26 to
 39 evaluations of a few samples each."""
 
