@@ -143,7 +143,8 @@ def region_masks(
     sure = layer_of_part[cores[window]] == layer
     if fitted:
         sure |= _is_alike(layer, _BODY_MARGIN if has_root(body) else _ARM_MARGIN)
-    small = (own & sure).flatten(1).sum(1) < _CORE_PIXELS
+    sure &= layer >= 0
+    small = torch.bincount(layer[sure].long(), minlength=len(names)) < _CORE_PIXELS
     # The last entry again for pixels that see no part; they belong to no layer anyway.
     small = functional.pad(small, (0, 1))[layer.long()]
     core = own & torch.where(small, _is_alike(layer, 1), sure)
@@ -154,8 +155,8 @@ def region_masks(
     blocks = grow(blocks, _REACH // _COARSE)
     far = blocks.repeat_interleave(_COARSE, -1).repeat_interleave(_COARSE, -2)
     near = far[:, : own.shape[1], : own.shape[2]] & ~grow(own, _GAP)
-    for first, second in body.neighbours:
-        i, j = (layer_of[body.part_names.index(name)] for name in (first, second))
+    own_layer = dict(zip(body.part_names, layer_of, strict=True))
+    for i, j in {(own_layer[first], own_layer[second]) for first, second in body.neighbours}:
         if i != j:
             near[i] &= ~own[j]
             near[j] &= ~own[i]

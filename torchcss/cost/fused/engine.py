@@ -217,7 +217,7 @@ class FusedEngine:
             if items is not None:
                 for whole, some in zip(result, own, strict=True):
                     whole[items] = some
-        for field in result:
+        for field in () if sane.all() else result:
             field[~sane] = np.nan
         if not left_out:
             return result, None
