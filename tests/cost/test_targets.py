@@ -24,14 +24,15 @@ def cost_of(name: str, link: str, *, place_only: bool = False, **options) -> Poi
 
 def states(cost: PointTargets, generator: torch.Generator) -> dict[str, Tensor]:
     body = cost.body
-    low = body.lower.clamp(min=-3)[cost.columns]
-    high = body.upper.clamp(max=3)[cost.columns]
+    columns = slice(None) if cost.columns is None else cost.columns
+    low = body.lower.clamp(min=-3)[columns]
+    high = body.upper.clamp(max=3)[columns]
     share = torch.rand(6, len(low), generator=generator, dtype=low.dtype)
     return {
         "anywhere": low + share * (high - low),
         "at bounds": torch.stack([low, high]),
         "at zero": torch.zeros(1, len(low), dtype=low.dtype),
-        "on target": body.bounds.project(torch.full_like(body.rest, 0.3))[None, cost.columns],
+        "on target": body.bounds.project(torch.full_like(body.rest, 0.3))[None, columns],
     }
 
 
@@ -58,7 +59,7 @@ def test_errors_and_their_jacobian(generator: torch.Generator) -> None:
     cost = cost_of("arm8", "r_wrist_link", columns=torch.tensor([1, 2, 4, 6]))
     x = states(cost, generator)["anywhere"]
     error, jacobian = cost.errors(x)
-    value = 0.5 / cost.sigma**2 * (cost.weight * error.square().sum(-1)).sum(-1)
+    value = (0.5 / cost.sigma**2 * error.square().sum(-1)).sum(-1)
     torch.testing.assert_close(value, cost.value(x))
     for item, state in enumerate(x):
         want = torch.autograd.functional.jacobian(lambda s: cost.errors(s[None])[0][0], state)

@@ -14,7 +14,7 @@ from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
-from torchcss.cost.targets import PointDistances
+from torchcss.cost.targets import PointTargets
 from torchcss.cost.term import differentiate_twice
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.io.motion.positions import (
@@ -255,7 +255,7 @@ def test_derivatives_against_autograd(subject: BodyModel, generator: torch.Gener
     states = moving(subject, count=3)
     count = len(LIMB_JOINTS)
     target = torch.randn(3, count, 3, generator=generator, dtype=torch.float64)
-    cost = PointDistances(
+    cost = PointTargets(
         body=subject,
         link=subject.marker_link[subject.joint_columns(LIMB_JOINTS)],
         offset=0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64),

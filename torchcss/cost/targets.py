@@ -2,13 +2,13 @@
 
 For points p that are fixed in links, with known places t,
 
-    f(x) = 1/2 sum_p w_p |p(x) - t_p|^2 / sigma^2
+    f(x) = 1/2 sum_p |p(x) - t_p|^2 / sigma_p^2
 
-in nats. With markers or triangulated joints this is an observation; with four points around the
-origin of one link it is zero exactly where that link has a given position and orientation, which is
-what inverse kinematics asks for (`pose_targets`, `torchcss.inverse_kinematics`). Value, gradient
-and exact Hessian are in closed form (`torchcss.body.lift`). `PointDistances` is the sum for targets
-that differ from item to item, with the priors of a body.
+in nats, with the priors of a body. With markers or triangulated joints this is an observation; with
+four points around the origin of one link, and no prior, it is zero exactly where that link has a
+given position and orientation, which is what inverse kinematics asks for (`pose_targets`,
+`torchcss.inverse_kinematics`). Value, gradient and exact Hessian are in closed form
+(`torchcss.body.lift`).
 """
 
 from __future__ import annotations
@@ -38,48 +38,68 @@ ARM = 0.25
 
 @frozen
 class PointTargets:
-    """Squared distances of points from where they should be; a `CostFunction`.
+    """Squared distances of points from where they should be, and priors; a `CostFunction`.
 
     Attributes:
         body: The body, hung on its base.
         link: The link that carries each point.
         offset: The points in the frames of their links, metres.
-        target: Where they should be in the world, metres.
-        weight: Weight of each point, not negative.
-        sigma: Standard deviation of a coordinate of weight one, metres.
-        columns: The parameters that x consists of, in its order; the others stay at `held`.
-        held: A whole state of the body.
+        target: Where they should be in the world, metres; the same for all items, or item by item.
+        sigma: Standard deviation of each point's coordinates, metres.
+        columns: The parameters that x consists of, in its order; None: all.
+        held: A whole state of the body, at which the others stay; None: there are none.
+        sticky: Whether the stabilisers say what the points do not tell.
+        repulsion: Keeps parts out of each other, if `pairs` are there too.
+        pairs: Which parts may collide.
     """
 
     body: BodyModel
     link: Int[Tensor, " p"]
     offset: Float[Tensor, "p 3"]
-    target: Float[Tensor, "p 3"]
-    weight: Float[Tensor, " p"]
-    sigma: float
-    columns: Int[Tensor, " m"]
-    held: Float[Tensor, " n"]
+    target: Float[Tensor, "*#batch p 3"]
+    sigma: Float[Tensor, " p"]
+    columns: Int[Tensor, " m"] | None = None
+    held: Float[Tensor, " n"] | None = None
+    sticky: bool = True
+    repulsion: Interpenetration | None = None
+    pairs: InterpenetrationPairs | None = None
 
     def take(self, items: Int[Tensor, " b"]) -> PointTargets:
-        """The same cost: all items have the same targets."""
-        return self
+        """The cost of some items; the same where all have the same targets."""
+        return self if self.target.dim() == 2 else replace(self, target=self.target[items])
 
     def whole(self, x: States) -> Float[Tensor, "*batch n"]:
         """States of the body: x, and what is held."""
+        if self.columns is None or self.held is None:
+            return x
         check_shape("x", x, len(self.columns))
         held = self.held.expand(*x.shape[:-1], len(self.held))
         return held.index_copy(-1, self.columns, x)
 
     def value(self, x: States) -> Float[Tensor, "*batch"]:
         """Cost in nats."""
-        _, points = self._pose(x)
-        return 0.5 / self.sigma**2 * ((points - self.target).square().sum(-1) @ self.weight)
+        return self.local_model(x).value
 
     def local_model(self, x: States) -> LocalModel:
         """Cost, gradient and exact Hessian."""
+        body, weight = self.body, self.sigma.pow(-2)
         pose, points = self._pose(x)
-        cost = squared_errors(points - self.target, self.weight / self.sigma**2)
-        value, slope, curvature = self.body.lift(pose, points, self.link, cost)
+        error = points - self.target
+        stiffness = weight[:, None, None] * torch.eye(3).to(error)
+        cost = PointCost(
+            0.5 * weight * error.square().sum(-1),
+            weight[:, None] * error,
+            stiffness.expand(*error.shape, 3),
+        )
+        total = body.lift(pose, points, self.link, cost)
+        if self.sticky:
+            mean, deviation = body.sticky_mean, body.sticky_deviation
+            total = total.plus(long_tailed(pose.x, mean, deviation, Stabiliser.nu))
+        if self.repulsion is not None and self.pairs is not None:
+            total = total.plus(self.repulsion.local_model(body, pose, self.pairs))
+        if self.columns is None:
+            return total
+        value, slope, curvature = total
         columns = self.columns
         return LocalModel(value, slope[..., columns], curvature[..., columns[:, None], columns])
 
@@ -89,70 +109,11 @@ class PointTargets:
         """By how much the points miss their targets, metres, and the derivatives of that in x."""
         pose, points = self._pose(x)
         moved = point_jacobian(self.body, pose.tree, points, self.link)
-        return points - self.target, moved[..., self.columns]
+        return points - self.target, moved if self.columns is None else moved[..., self.columns]
 
     def _pose(self, x: States) -> tuple[BodyPose, Float[Tensor, "*batch p 3"]]:
         pose = self.body.pose(self.whole(x))
         return pose, self.body.points_on_links(pose.tree, self.link, self.offset)
-
-
-@frozen
-class PointDistances:
-    """Squared distances from places of their own in every item, and priors; a `CostFunction`.
-
-    Attributes:
-        body: The body.
-        link: The link that carries each point.
-        offset: Its place in that link's frame, metres.
-        target: Where it should be in the world, item by item, metres.
-        sigma: Its standard deviation, metres.
-        repulsion: Keeps parts out of each other, if `pairs` are there too.
-        pairs: Which parts may collide.
-    """
-
-    body: BodyModel
-    link: Int[Tensor, " p"]
-    offset: Float[Tensor, "p 3"]
-    target: Float[Tensor, "b p 3"]
-    sigma: Float[Tensor, " p"]
-    repulsion: Interpenetration | None = None
-    pairs: InterpenetrationPairs | None = None
-
-    def take(self, items: Int[Tensor, " s"]) -> PointDistances:
-        """The cost of some items."""
-        return replace(self, target=self.target[items])
-
-    def value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        """Cost in nats."""
-        return self.local_model(x).value
-
-    def local_model(self, x: Float[Tensor, "b n"]) -> LocalModel:
-        """Cost, gradient and exact Hessian."""
-        body, pose = self.body, self.body.pose(x)
-        points = body.points_on_links(pose.tree, self.link, self.offset)
-        cost = squared_errors(points - self.target, self.sigma.pow(-2))
-        total = body.lift(pose, points, self.link, cost)
-        # What the points do not tell.
-        sticky = long_tailed(x, body.sticky_mean, body.sticky_deviation, Stabiliser.nu)
-        total = total.plus(sticky)
-        if self.repulsion is None or self.pairs is None:
-            return total
-        return total.plus(self.repulsion.local_model(body, pose, self.pairs))
-
-
-def squared_errors(error: Float[Tensor, "*batch p 3"], weight: Float[Tensor, " p"]) -> PointCost:
-    """`1/2 w |e|^2` of points that miss their places by e, with its derivatives.
-
-    Args:
-        error: By how much they miss them, metres.
-        weight: w of each point, one over square metres.
-    """
-    hessian = weight[:, None, None] * torch.eye(3).to(error)
-    return PointCost(
-        0.5 * weight * error.square().sum(-1),
-        weight[:, None] * error,
-        hessian.expand(*error.shape, 3),
-    )
 
 
 def pose_targets(
@@ -195,10 +156,8 @@ def pose_targets(
         link=torch.full((num,), body.tree.link_index(link), device=body.tie.device),
         offset=corners,
         target=target,
-        weight=corners.new_full((num,), 1 / num),
-        sigma=sigma,
-        columns=torch.arange(body.num_parameters, device=body.tie.device)
-        if columns is None
-        else columns,
+        sigma=corners.new_full((num,), sigma * num**0.5),
+        columns=columns,
         held=body.rest if held is None else held,
+        sticky=False,
     )

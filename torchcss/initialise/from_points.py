@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
-from torchcss.cost.targets import PointDistances
+from torchcss.cost.targets import PointTargets
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds, Keypoints, Vectors
 from torchcss.vision.camera import Camera
@@ -54,7 +54,7 @@ def start_from_points(
     points = points * _scale(body, names, points, known)
     points = points[known] + _place(camera, keypoints.positions[known].to(points), points[known])
     joint = joint[known]
-    reach = PointDistances(
+    reach = PointTargets(
         body=body,
         link=body.marker_link[joint],
         offset=body.marker_offset[joint],

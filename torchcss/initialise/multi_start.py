@@ -38,7 +38,7 @@ from torchcss.body.root import ROOT_NAMES, has_root, unwound
 from torchcss.body.rotations import within_half_turn
 from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.joints import JointTerm
-from torchcss.cost.targets import PointDistances
+from torchcss.cost.targets import PointTargets
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.mixture import GaussianMixture, cheapest_first, distinct_modes
@@ -297,7 +297,7 @@ def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, nu
     shape = (len(x), *flipped.shape[:2])
     joints = body.pose(x).joints[:, None, None].expand(*shape, -1, 3)
     target = segments.flip(joints, flipped.expand(*shape, -1), cost.camera.centre_world)
-    reach = PointDistances(
+    reach = PointTargets(
         body=body,
         link=body.marker_link[segments.joint],
         offset=body.marker_offset[segments.joint],

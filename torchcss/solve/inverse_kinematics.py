@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import compress
 from typing import NamedTuple
 
 import torch
@@ -211,6 +212,7 @@ class _Problem(NamedTuple):
     """The cost over the free parameters, their limits, and where samples start."""
 
     states: SolutionSet
+    names: list[str]
     lower: Float[Tensor, " m"]
     upper: Float[Tensor, " m"]
     search: Search
@@ -237,14 +239,15 @@ class _Problem(NamedTuple):
         cost = pose_targets(body, link, pose, columns=columns, held=held, sigma=search.sigma)
         bounds = Bounds(body.lower[columns], body.upper[columns])
         endless = ~(bounds.lower.isfinite() & bounds.upper.isfinite())
-        turns = body.is_angle[columns]
-        if bool((endless & ~turns).any()):
-            names = [body.state_names[int(i)] for i in columns[endless & ~turns]]
-            raise ConfigurationError(f"{', '.join(names)}: a length without limits; fix it")
+        names = [body.state_names[int(i)] for i in columns]
+        if bool((free := endless & ~body.is_angle[columns]).any()):
+            lengths = ", ".join(compress(names, free.tolist()))
+            raise ConfigurationError(f"{lengths}: a length without limits; fix it")
         period = 2 * math.pi * endless.to(bounds.lower)
         rounding = 64 * torch.finfo(body.dtype).eps
         return _Problem(
             SolutionSet(cost, bounds, period, max(search.tolerance, rounding)),
+            names,
             torch.where(endless, -math.pi, bounds.lower),
             torch.where(endless, math.pi, bounds.upper),
             search,
@@ -264,7 +267,7 @@ class _Problem(NamedTuple):
             raise ConfigurationError(
                 f"{len(self.lower)} free parameters for a pose of {rank}: expected one more at "
                 f"most; fix {redundancy - 1} or more of "
-                f"{[self.states.cost.body.state_names[int(i)] for i in self.states.cost.columns]}"
+                f"{self.names}"
             )
         return redundancy
 

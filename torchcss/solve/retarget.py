@@ -47,7 +47,7 @@ from torchcss.body.root import ROOT_NAMES, free_turns
 from torchcss.body.rotations import root_angles, root_rotation
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.penetration import Penetration, PenetrationDepth
-from torchcss.cost.targets import PointDistances
+from torchcss.cost.targets import PointTargets
 from torchcss.errors import ConfigurationError, check_positive
 from torchcss.inference.smoothing import Refinement, Transition, best_path, refine
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -448,11 +448,11 @@ def _cost(
     target: Float[Tensor, "t limbs+others 3"],
     others: list[_Anchored],
     choice: Retargeting,
-) -> PointDistances:
+) -> PointTargets:
     """Limbs and other joints where they shall be, frame by frame."""
     columns = body.joint_columns(names)
     sigma = [choice.sigma] * len(names) + [choice.sigma_others] * len(others)
-    return PointDistances(
+    return PointTargets(
         body=body,
         link=torch.cat([body.marker_link[columns], torch.tensor([o.link for o in others]).long()]),
         offset=torch.cat([body.marker_offset[columns], *(o.offset[None] for o in others)]),
@@ -462,7 +462,7 @@ def _cost(
 
 
 def _fit(
-    cost: PointDistances,
+    cost: PointTargets,
     root: Float[Tensor, "t 6"],
     rate: float,
     choice: Retargeting,
