@@ -806,6 +806,18 @@ def test_cvat_of_points_without_skeletons(tmp_path: Path) -> None:
     check(read(write(tmp_path / "annotations.xml", text)), empty=(3,))
 
 
+def test_cvat_of_people_who_are_many_points(tmp_path: Path) -> None:
+    tracks = ""
+    for number, of in enumerate((other, person)):
+        marks = ""
+        for t in SEEN:
+            places = ";".join(f"{u},{v}" for u, v, _ in of(t))
+            marks += f'<points frame="{t}" outside="0" occluded="0" points="{places}"/>'
+        tracks += f'<track id="{number}" label="person">{marks}</track>'
+    text = f"<annotations>{tracks}</annotations>"
+    check(read(write(tmp_path / "annotations.xml", text)), empty=(3,))
+
+
 def test_cvat_of_pictures(tmp_path: Path) -> None:
     text = ""
     for t in reversed(range(FRAMES)):

@@ -22,22 +22,22 @@ def test_csv_with_and_without_heading(tmp_path: Path):
     for text in (rows, "joint,u,v,confidence\n" + rows):
         path.write_text(text)
         found = read_joints(path, image_size_wh=SIZE)
-        assert found.names == ("l_wrist", "r_knee")
-        assert found.positions.tolist() == [[10.5, 20], [30, 40]]
-        assert found.confidence.tolist() == [1, 0.5]
+        assert found.names == ("l_wrist", "r_knee", "nose")
+        assert found.positions.tolist() == [[10.5, 20], [30, 40], [0, 0]]
+        assert found.confidence.tolist() == [1, 0.5, 0]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "the file is empty"),
-        ("a,b,c\n", "no joints"),
-        ("l_wrist,1,2\ntentacle,1,2\n", "row 2: unknown joint"),
+        ("a,b,c\n", "nothing below it"),
+        ("l_wrist,10,20\ntentacle,10,20\n", "unknown joint 'tentacle'"),
         ("l_wrist,1\n", "row 1"),
         ("l_wrist,1,2\nr_wrist,1,x\n", "row 2"),
-        ("l_wrist,1O,2\nr_wrist,1,2\n", "row 1: expected joint, u, v"),
+        ("l_wrist,1O,2\nr_wrist,1,2\n", "row 1: .* found 'l_wrist, 1O, 2'"),
         ("l_wrist,1,inf\n", "row 1"),
-        ("l_wrist,1,2\nleft_wrist,1,2\n", "twice"),
+        ("l_wrist,10,20\nleft_wrist,10,20\n", "'left_wrist', or it is there twice"),
     ],
 )
 def test_spoilt_csv(tmp_path: Path, text: str, message: str):
@@ -76,11 +76,13 @@ def test_csv_of_landmarks(tmp_path: Path, named: bool):
     assert found.positions[found.names.index("l_wrist")].tolist() == [319.5, 119.5]
 
 
-def test_rows_of_joints_are_pixels(tmp_path: Path):
+def test_rows_of_joints_may_be_fractions(tmp_path: Path):
     path = tmp_path / "joints.csv"
     path.write_text("l_wrist,0.5,0.5\n")
-    with pytest.raises(KeypointError, match="leave normalised out"):
-        read_joints(path, image_size_wh=SIZE, normalised="zero-one")
+    with pytest.raises(KeypointError, match="--normalised zero-one"):
+        read_joints(path, image_size_wh=SIZE)
+    found = read_joints(path, image_size_wh=SIZE, normalised="zero-one")
+    assert found.positions.tolist() == [[319.5, 239.5]]
 
 
 def test_mediapipe(tmp_path: Path):
@@ -125,3 +127,19 @@ def test_coco_detections_of_a_picture_with_any_number(tmp_path: Path):
     path.write_text(json.dumps([{**row, "image_id": number} for number in (1, 2)]))
     with pytest.raises(KeypointError, match="nobody in the first frame"):
         read_joints(path, image_size_wh=SIZE)
+
+
+def test_a_picture_with_any_number_that_somebody_annotated(tmp_path: Path):
+    path, size = tmp_path / "a.json", {"original_width": 640, "original_height": 480}
+    value = {"x": 50, "y": 25, "keypointlabels": ["left_wrist"]}
+    mark = {"type": "keypointlabels", "value": value, **size}
+    point = {"shape_attributes": {"name": "point", "cx": 319.5, "cy": 119.5},
+             "region_attributes": {"joint": {"left_wrist": True}}}  # fmt: skip
+    for content in (
+        [{"data": {"image": "s3://bucket/p7.jpg"}, "annotations": [{"result": [mark]}]}],
+        {"p7.jpg9": {"filename": "p7.jpg", "regions": [point]}},
+    ):
+        path.write_text(json.dumps(content))
+        found = read_joints(path, image_size_wh=SIZE)
+        assert found.names == ("l_wrist",)
+        assert found.positions.tolist() == [[319.5, 119.5]]

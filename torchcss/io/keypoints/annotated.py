@@ -162,7 +162,8 @@ def read_label_studio(content: Sequence[Any]) -> People:
                     raise KeypointError(f"{where}: annotated in a turned picture; export COCO's")
             frames[_picture(where, task)] = _people(where, points, known=False)
     people, names = united(frames)
-    return People(people, names, ["format: Label Studio"], size_wh=one_size(sizes))
+    size = one_size(sizes)
+    return People(people, names, ["format: Label Studio"], whole=len(frames) == 1, size_wh=size)
 
 
 def _marks(task: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -1,8 +1,9 @@
 """CVAT's own XML of pictures and of videos, in which people are skeletons or single points.
 
-A `skeleton` is a person, its `points` are the joints. Without skeletons a label is a joint of the
-only person there is. A video has a `track` for each of them, with a line for every frame, in which
-it may be `outside`; pictures have names.
+A `skeleton` is a person, its `points` are the joints, and so is an element of several points, which
+have an order only. Without those a label is a joint of the only person there is. A video has a
+`track` for each of them, with a line for every frame, in which it may be `outside`; pictures have
+names.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torchcss.body.files.xml import parse_xml
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
 from torchcss.io.keypoints.frames import plain_name
+from torchcss.io.keypoints.mediapipe import reordered
 from torchcss.io.keypoints.people import Frames, Key, People, Person, one_size, united
 
 _HIDDEN = 0.5
@@ -40,13 +42,17 @@ def read_cvat(path: Path) -> People:
         points = element.findall("points") if element.tag == "skeleton" else [element]
         for point in points:
             name = point.get("label", element.get("label", ""))
-            if not outside and point.get("outside") != "1":
-                people.setdefault(who, {})[name] = _joint(point, name)
+            several = point.get("points", "").split(";")
+            for number, text in enumerate(several):
+                joint = name if len(several) == 1 else str(number)
+                if not outside and point.get("outside") != "1":
+                    people.setdefault(who, {})[joint] = _joint(point, joint, text)
     frames: Frames = {
         place: [Person.by_name(joints, _track(who)) for who, joints in people.items()]
         for place, people in found.items()
     }
     people, names = united(frames)
+    people, names = reordered(people, names or ())
     said = [
         (each.findtext("width"), each.findtext("height")) for each in root.iter("original_size")
     ]
@@ -74,22 +80,26 @@ def _shapes(root: Element) -> Iterator[tuple[Key, str, Element, bool]]:
             if element.tag in ("skeleton", "points"):
                 said = element.find("attribute[@name='track_id']")
                 who = f"#{index}" if said is None else said.text or f"#{index}"
-                yield _name(image), who if element.tag == "skeleton" else _ALONE, element, False
+                yield _name(image), who if _is_person(element) else _ALONE, element, False
     for track in root.iter("track"):
         for element in track:
             if element.tag in ("skeleton", "points"):
                 if element.tag == "points" and "label" not in element.attrib:
                     element.set("label", track.get("label", ""))
-                who = track.get("id", "0") if element.tag == "skeleton" else _ALONE
+                who = track.get("id", "0") if _is_person(element) else _ALONE
                 place = element.get("frame", "")
                 if not place.isdecimal():
                     raise KeypointError(f"track {who}: expected a frame's number, found {place!r}")
                 yield int(place), who, element, element.get("outside") == "1"
 
 
-def _joint(point: Element, name: str) -> list[float]:
+def _is_person(element: Element) -> bool:
+    """Whether an element is somebody, and not a joint of the only one."""
+    return element.tag == "skeleton" or ";" in element.get("points", "")
+
+
+def _joint(point: Element, name: str, text: str) -> list[float]:
     """u, v and confidence of a point."""
-    text = point.get("points", "")
     try:
         u, v = map(float, text.split(","))
     except ValueError:

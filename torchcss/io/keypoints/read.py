@@ -469,7 +469,8 @@ def _joint_names(
     unused = [name for name in names if name not in (there or JOINT_NAMES)]
     if people.by_hand and unused:
         raise KeypointError(
-            f"unknown joint {unused[0]!r}; the known ones are {', '.join(there or JOINT_NAMES)}"
+            f"unknown joint {unused[0]!r}, or it is there twice; the known ones are "
+            f"{', '.join(there or JOINT_NAMES)}"
         )
     if there and len(unused) == len(names):
         raise KeypointError(

@@ -98,7 +98,7 @@ def people_of_rows(rows: list[Row]) -> People:
         columns, body, report = _deeplabcut(rows)
         joints, frames = _read_rows(columns, body)
         return People(frames, tuple(joints), report, first=0)
-    rows = _with_one_heading(rows) if len(rows) > 1 else rows
+    rows = _by_hand(_with_one_heading(rows) if len(rows) > 1 else rows)
     if len(rows) == 1:
         raise KeypointError("row 1: a heading and nothing below it; get a complete copy")
     heading = rows[0][1]
@@ -123,7 +123,8 @@ def people_of_rows(rows: list[Row]) -> People:
         return People(people, None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
-    return People(people, names, report, first=first)
+    by_hand = columns.joint is not None and columns.frame is None
+    return People(people, names, report, first=first, by_hand=by_hand)
 
 
 def _told(columns: _Columns, heading: Sequence[str]) -> list[str]:
@@ -223,6 +224,19 @@ def _ended(row: Row) -> list[str]:
     """The cells of a row without empty ones at its end."""
     cells = row[1]
     return cells[: max((n for n, cell in enumerate(cells, start=1) if cell), default=0)]
+
+
+def _by_hand(rows: list[Row]) -> list[Row]:
+    """The same with a heading where rows are a joint, u, v and maybe its confidence."""
+    number, above = rows[0]
+    lengths = {len(_ended(row)) for row in rows}
+    if not lengths <= {1, 3, 4} or lengths == {1} or _NUMBER.match(above[0] or "0"):
+        return rows
+    headed = words.plain_word(above[0]) in words.JOINT_WORDS and _PARTS.get(above[1].lower()) == 0
+    if not headed and not all(not cell or _NUMBER.match(cell) for cell in above[1:]):
+        return rows
+    full = [(n, [*cells, "", ""][:4]) for n, cells in rows[headed:]]
+    return [(number, ["joint", "u", "v", "confidence"]), *full]
 
 
 def _with_one_heading(rows: list[Row]) -> list[Row]:
