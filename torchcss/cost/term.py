@@ -7,7 +7,7 @@ of posed bodies (`Posed`):
 | kind | bound | gives |
 |---|---|---|
 | `image` | `BoundImage` | value and derivatives of each of its points, in the points' positions |
-| `prior` | `BoundPrior` | value and derivatives in the state x |
+| `prior` | `OnStates` | value and derivatives in the state x |
 | `weight-only` | `BoundWeight` | a value that counts in the weights of modes, not in the search |
 
 To add a term, write a class that derives from `Term` and add it to
@@ -74,7 +74,7 @@ class Term(Protocol):
         """The term in the coarse cost that finds what moved too fast; None: it is left out."""
         return self if self.kind == "prior" else None
 
-    def prepare(self, context: FrameContext) -> BoundImage | BoundPrior | BoundWeight | None:
+    def prepare(self, context: FrameContext) -> BoundImage | OnStates | BoundWeight | None:
         """Bind the term to one view of one frame; None: the frame says nothing to it."""
         ...
 
@@ -112,18 +112,6 @@ class BoundImage(Protocol):
 
     def point_cost(self, posed: Posed, *, gauss_newton: bool = False) -> PointCost:
         """Value of each point and its derivatives in the point's position, all else held."""
-        ...
-
-
-class BoundPrior(Protocol):
-    """A prior that knows its frame."""
-
-    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
-        """Cost, nats."""
-        ...
-
-    def local_model(self, posed: Posed, curvature: Curvature) -> LocalModel:
-        """Cost and derivatives in the state."""
         ...
 
 
@@ -239,7 +227,7 @@ class OnPoints:
 
 @dataclass(frozen=True, eq=False)
 class OnStates:
-    """A prior on states; a `BoundPrior`.
+    """A prior on states that knows its frame.
 
     Attributes:
         model: Cost and derivatives, by the curvature that is asked for.
