@@ -50,7 +50,7 @@ def test_value_is_the_docstring(generator: torch.Generator) -> None:
     camera, field, term = make_camera(), a_field(generator), SurfaceTerm(sigma=0.7)
     (points, normals), targets = some_nodes(generator), some_targets(generator)
     nodes = facing_nodes(points, normals, camera.centre_world)
-    value = term.value(nodes, camera, field, targets)
+    value = term.point_cost(nodes, camera, field, targets).value
     for item in range(2):
         for node in range(points.shape[1]):
             uv = camera.project(points[item, node][None]).uv
@@ -69,7 +69,6 @@ def test_derivatives_are_those_of_autograd(
     (points, normals), targets = some_nodes(generator), some_targets(generator)
     nodes = facing_nodes(points, normals, camera.centre_world)
     cost = term.point_cost(nodes, camera, field, targets)
-    torch.testing.assert_close(cost.value, term.value(nodes, camera, field, targets))
 
     def total(at: Tensor) -> Tensor:
         error = field.value(camera.project(at).uv) - targets.level
@@ -94,7 +93,7 @@ def test_the_hessian_is_that_of_gauss_and_newton(generator: torch.Generator) -> 
     agreed = targets._replace(level=field.value(camera.project(points).uv))
     model = term.point_cost(nodes, camera, field, agreed)
     at = points.clone().requires_grad_()
-    total = term.value(nodes._replace(points=at), camera, field, agreed).sum()
+    total = term.point_cost(nodes._replace(points=at), camera, field, agreed).value.sum()
     (gradient,) = torch.autograd.grad(total, at, create_graph=True)
     rows = [
         torch.autograd.grad(gradient[..., axis].sum(), at, retain_graph=True)[0]
@@ -113,7 +112,7 @@ def test_where_the_surface_was_it_costs_nothing(generator: torch.Generator) -> N
     visible[:, 7] = 0
     nodes = facing_nodes(points, towards, camera.centre_world)._replace(visible=visible)
     targets = surface_targets(nodes, camera, field)
-    assert torch.equal(term.value(nodes, camera, field, targets), 0 * visible)
+    assert torch.equal(term.point_cost(nodes, camera, field, targets).value, 0 * visible)
     hidden = targets.weight == 0
     assert hidden[:, [0, 1, 7]].all()
     uv, valid = camera.project(points).uv, camera.project(points).valid
@@ -130,5 +129,6 @@ def test_turning_away_is_no_gain(generator: torch.Generator) -> None:
     points, _ = some_nodes(generator)
     towards = torch.nn.functional.normalize(camera.centre_world - points, dim=-1)
     targets = surface_targets(facing_nodes(points, towards, camera.centre_world), camera, field)
-    away = term.value(facing_nodes(points, -towards, camera.centre_world), camera, field, targets)
-    torch.testing.assert_close(away, term.fitted_level * targets.weight)
+    nodes = facing_nodes(points, -towards, camera.centre_world)
+    away = term.point_cost(nodes, camera, field, targets)
+    torch.testing.assert_close(away.value, term.fitted_level * targets.weight)

@@ -252,7 +252,6 @@ def test_gradient_is_that_of_the_value(generator: torch.Generator) -> None:
     """By central differences; facing, a ramp, moves a little with the pose."""
     cost, x = a_cost(generator)
     model = cost.local_model(x)
-    torch.testing.assert_close(model.value, cost.value(x))
     step = 1e-6
     for column in range(x.shape[-1]):
         move = torch.zeros_like(x)

@@ -28,7 +28,6 @@ from typing import NamedTuple
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.cost.term import Values
 from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc, RobustPotential
 from torchcss.types import PointCost, frozen
@@ -87,27 +86,19 @@ class SurfaceTerm:
         """`rho` on the squared difference of contrasts."""
         return Leclerc(nu=self.nu, sigma=self.sigma)
 
-    def value(
+    def point_cost(
         self, nodes: SeenNodes, camera: Camera, contrast: SplineField, targets: SurfaceTargets
-    ) -> Values:
-        """Cost of every node, in units of nu.
+    ) -> PointCost:
+        """Cost of every node, in units of nu, with derivatives in the nodes' positions.
+
+        The Hessian is Gauss and Newton's: it leaves out the curvature of the picture, of rho and of
+        the projection, so that it has no negative eigenvalue.
 
         Args:
             nodes: Nodes at the sample's pose, and which of them face the camera.
             camera: Camera of this frame, at the size of the picture.
             contrast: Local contrast of this frame.
             targets: Targets of each sample's own parent, or of one for all.
-        """
-        error = contrast.value(camera.project(nodes.points).uv) - targets.level
-        return self._composed(self.potential(error.square()).rho, nodes, targets)
-
-    def point_cost(
-        self, nodes: SeenNodes, camera: Camera, contrast: SplineField, targets: SurfaceTargets
-    ) -> PointCost:
-        """The same with its gradient and its Gauss-Newton Hessian in the nodes' positions.
-
-        That leaves out the curvature of the picture, of rho and of the projection, so that it has
-        no negative eigenvalue. See `value` for the arguments.
         """
         model = camera.project_with_derivatives(nodes.points)
         look = contrast.sample(model.uv)
@@ -116,9 +107,6 @@ class SurfaceTerm:
         weight = targets.weight * nodes.exists
         hessian = (weight * first)[..., None, None] * slope[..., :, None] * slope[..., None, :]
         gradient = (weight * first * error)[..., None] * slope
-        value = self._composed(rho, nodes, targets)
-        return camera.pull_back(model, value, gradient, hessian, gauss_newton=True)
-
-    def _composed(self, rho: Tensor, nodes: SeenNodes, targets: SurfaceTargets) -> Values:
         back_facing = self.fitted_level * self.nu
-        return targets.weight * (nodes.exists * 0.5 * rho + (1 - nodes.exists) * back_facing)
+        value = targets.weight * (nodes.exists * 0.5 * rho + (1 - nodes.exists) * back_facing)
+        return camera.pull_back(model, value, gradient, hessian, gauss_newton=True)

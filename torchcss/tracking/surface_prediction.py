@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.body.catalog import PROPORTIONS
-from torchcss.body.model import BodyModel, BodyPose
+from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
@@ -253,18 +253,12 @@ class SurfaceCost:
 
     def value(self, x: Float[Tensor, "b m"]) -> Numbers:
         """Cost, nats."""
-        points, normals = self._surface(self.body.pose(self._whole(x)))
-        total = 0.5 * ((x - self.expected) / self.deviation).square().sum(-1)
-        for camera, contrast, targets in self.views:
-            nodes = facing_nodes(points, normals, camera.centre_world)
-            cost = self.term.value(nodes, camera, contrast, targets)
-            total = total + (_share(targets) * cost).sum(-1)
-        return total
+        return self.local_model(x).value
 
     def local_model(self, x: Float[Tensor, "b m"]) -> LocalModel:
         """Cost, gradient and Gauss-Newton Hessian, facing held fixed."""
-        pose = self.body.pose(self._whole(x))
-        points, normals = self._surface(pose)
+        pose = self.body.pose(self.held.index_copy(-1, self.columns, x))
+        points, normals = (each[..., self.chosen, :] for each in self.nodes(self.body, pose))
         value, gradient, hessian = points.new_zeros(()), points.new_zeros(()), points.new_zeros(())
         for view in self.views:
             nodes = facing_nodes(points, normals, view.camera.centre_world)
@@ -287,13 +281,6 @@ class SurfaceCost:
             lifted.gradient[:, columns] + off / self.deviation,
             lifted.hessian[:, columns[:, None], columns] + prior,
         )
-
-    def _whole(self, x: Tensor) -> Tensor:
-        return self.held.index_copy(-1, self.columns, x)
-
-    def _surface(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
-        points, normals = self.nodes(self.body, pose)
-        return points[..., self.chosen, :], normals[..., self.chosen, :]
 
 
 def _share(targets: SurfaceTargets) -> Float[Tensor, "b 1"]:
