@@ -502,16 +502,12 @@ def _read_easymocap(path: Path) -> dict[str, Entry]:
     names = first.get("names")
     if not isinstance(names, list) or not all(isinstance(name, (str, int)) for name in names):
         raise unexpected(CameraError, intrinsics, "'names', as EasyMocap writes them", names)
-    cameras = {}
+    entries = {}
     for name in map(str, names):
-        cameras[name] = Entry(
-            first.get(f"K_{name}"),
-            _size(first.get(f"W_{name}"), first.get(f"H_{name}")),
-            first.get(f"dist_{name}", first.get(f"D_{name}")),
-            second.get(f"Rot_{name}", second.get(f"R_{name}")),
-            second.get(f"T_{name}"),
-        )
-    return cameras
+        both, end = [*first.items(), *second.items()], f"_{name}"
+        own = {key.removesuffix(end): each for key, each in both if key.endswith(end)}
+        entries[name] = _entry({**own, "R": own.get("Rot", own.get("R"))})  # the same as a vector
+    return entries
 
 
 def _read_matlab(path: Path) -> dict[str, Entry]:

@@ -390,7 +390,7 @@ def test_via(tmp_path: Path, form: str) -> None:
     assert any("joints by 'what'" in line for line in found.report)
 
 
-@pytest.mark.parametrize("form", ["long", "short", "boxes", "relations"])
+@pytest.mark.parametrize("form", ["long", "short", "boxes", "relations", "SLEAP's"])
 def test_label_studio(tmp_path: Path, form: str) -> None:
     """Percent of a picture of twice the size; people hang on boxes."""
 
@@ -420,10 +420,13 @@ def test_label_studio(tmp_path: Path, form: str) -> None:
         if form == "short":
             kp = [mark | mark.pop("value") for mark in results]
             task = {"image": image, "id": t, "kp": kp, "annotator": 1}
+        if form == "SLEAP's":
+            task |= {"data": {}, "meta": {"video": {"filename": "a.mp4", "frame_idx": t}}}
         content.append(task)
     path = write(tmp_path / "a.json", content)
     check(read(path), (3,))
-    check(read(path, frame_names=[f"f{t}.jpg" for t in T]), (3,))
+    if form != "SLEAP's":
+        check(read(path, frame_names=[f"f{t}.jpg" for t in T]), (3,))
     if form == "long":
         for spoilt in ({"data": 0, "annotations": []}, {**content[0], "annotations": [3]}):
             with pytest.raises(KeypointError, match=r"task 1: (expected the|not Label)"):

@@ -17,6 +17,7 @@ from torchcss.errors import KeypointError
 from torchcss.files import real_numbers, refusing, unexpected
 from torchcss.io.keypoints.people import (
     Frames,
+    Key,
     People,
     Person,
     number_array,
@@ -30,7 +31,8 @@ VIA_SHAPE = "region_shape_attributes"
 """A column of VIA's tables."""
 
 Point = tuple[str | None, str, Sequence[float]]
-"""Of whom a point is, None: of the only one; which joint it is; u and v."""
+"""Of whom a point is, which joint, and u, v and maybe confidence. None is the only one; who begins
+with # may be another one in the next picture."""
 
 Regions = dict[str, list[tuple[Any, ...]]]
 """Shape and attributes of every region, by picture."""
@@ -39,15 +41,18 @@ _MARK = ("x", "y", "original_width", "original_height")
 """What is known of a point in Label Studio: percent of the picture, and its size."""
 
 
-def _people(where: str, points: Iterable[Point], *, known: bool = True) -> list[Person]:
-    """The people whose joints are these points, `known` by the same words in other pictures."""
+def people_of_points(where: str, points: Iterable[Point]) -> list[Person]:
+    """The people whose joints are these points."""
     people: dict[str | None, dict[str, list[float]]] = {}
-    for who, label, (u, v) in points:
+    for who, label, place in points:
         joints = people.setdefault(who, {})
         if label in joints:
             raise KeypointError(f"{where}: {label!r} twice; tell people apart, as by a group_id")
-        joints[label] = real_numbers([u, v, 1.0], where, KeypointError).tolist()
-    return [Person.by_name(joints, who if known else None) for who, joints in people.items()]
+        joints[label] = real_numbers([*place, 1.0][:3], where, KeypointError).tolist()
+    return [
+        Person.by_name(joints, None if (who or "#").startswith("#") else who)
+        for who, joints in people.items()
+    ]
 
 
 def labelme_people(where: str, shapes: object) -> list[Person]:
@@ -63,7 +68,7 @@ def labelme_people(where: str, shapes: object) -> list[Person]:
             points.append(
                 (None if group is None else f"{group}", f"{shape.get('label')}", point[0])
             )
-    return _people(where, points)
+    return people_of_points(where, points)
 
 
 # VIA.
@@ -118,7 +123,7 @@ def _via_people(found: Regions) -> People:
     known = {key: sum(map(bool, map(canonical_joint_name, own))) for key, own in values.items()}
     joint = max(values, key=lambda key: (known[key], len(values[key])), default="")
     frames: Frames = {
-        name: _people(
+        name: people_of_points(
             name, [(track_of({**about, joint: ""}), about.get(joint, ""), uv) for about, uv in own]
         )
         for name, own in marks.items()
@@ -157,13 +162,14 @@ def read_label_studio(content: Sequence[Any]) -> People:
                 sizes.add((size[0], size[1]))
                 # From the corner; the centres of pixels are at integers.
                 place = (0.01 * x * size[0] - 0.5, 0.01 * y * size[1] - 0.5)
-                points.append((mark.get("hangs_on"), mark["keypointlabels"][0], place))
+                points.append((f"#{mark.get('hangs_on')}", mark["keypointlabels"][0], place))
                 if mark.get("image_rotation"):
                     raise KeypointError(f"{where}: annotated in a turned picture; export COCO's")
-            frames[_picture(where, task)] = _people(where, points, known=False)
+            frames[_picture(where, task)] = people_of_points(where, points)
     people, names = united(frames)
+    first = 0 if any(isinstance(key, int) for key in frames) else None
     size = one_size(sizes)
-    return People(people, names, ["format: Label Studio"], whole=len(frames) == 1, size_wh=size)
+    return People(people, names, ["format: Label Studio"], first=first, size_wh=size)
 
 
 def _marks(task: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -183,8 +189,11 @@ def _marks(task: Mapping[str, Any]) -> list[dict[str, Any]]:
     return marks
 
 
-def _picture(where: str, task: Mapping[str, Any]) -> str:
-    """The name of a task's picture, without what is put before it when it is uploaded."""
+def _picture(where: str, task: Mapping[str, Any]) -> Key:
+    """A task's picture, without what is put before it when it is uploaded; or its frame (SLEAP)."""
+    meta = task.get("meta") or {}
+    if (frame := meta.get("video", {}).get("frame_idx")) is not None:
+        return int(frame)
     data = task["data"] if isinstance(task.get("data"), dict) else task
     for value in data.values():
         if isinstance(value, str) and re.search(r"(?i)\.(jpe?g|png|bmp|tiff?|webp)$", value):

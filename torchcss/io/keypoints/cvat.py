@@ -15,15 +15,13 @@ from xml.etree.ElementTree import Element
 from torchcss.body.files.xml import parse_xml
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
+from torchcss.io.keypoints.annotated import Point, people_of_points
 from torchcss.io.keypoints.frames import plain_name
 from torchcss.io.keypoints.mediapipe import reordered
-from torchcss.io.keypoints.people import Frames, Key, People, Person, one_size, united
+from torchcss.io.keypoints.people import Frames, Key, People, one_size, united
 
 _HIDDEN = 0.5
 """Confidence of a joint that is marked as occluded: where it is was guessed."""
-
-_ALONE = ""
-"""Who has the points that are in no skeleton."""
 
 
 def read_cvat(path: Path) -> People:
@@ -36,21 +34,16 @@ def read_cvat(path: Path) -> People:
     if root.tag != "annotations":
         raise KeypointError(f"expected CVAT's annotations, found <{root.tag}>")
     pictures = [*root.iter("image")]
-    found: dict[Key, dict[str, dict[str, list[float]]]] = {_name(each): {} for each in pictures}
+    found: dict[Key, list[Point]] = {_name(each): [] for each in pictures}
     for place, who, element, outside in _shapes(root):
-        people = found.setdefault(place, {})
-        points = element.findall("points") if element.tag == "skeleton" else [element]
-        for point in points:
+        own = found.setdefault(place, [])
+        for point in element.findall("points") if element.tag == "skeleton" else [element]:
             name = point.get("label", element.get("label", ""))
             several = point.get("points", "").split(";")
-            for number, text in enumerate(several):
-                joint = name if len(several) == 1 else str(number)
-                if not outside and point.get("outside") != "1":
-                    people.setdefault(who, {})[joint] = _joint(point, joint, text)
-    frames: Frames = {
-        place: [Person.by_name(joints, _track(who)) for who, joints in people.items()]
-        for place, people in found.items()
-    }
+            if not outside and point.get("outside") != "1":
+                labels = [name] if len(several) == 1 else map(str, range(len(several)))
+                own += [(who, n, _joint(point, n, t)) for n, t in zip(labels, several, strict=True)]
+    frames: Frames = {place: people_of_points(f"{place}", own) for place, own in found.items()}
     people, names = united(frames)
     people, names = reordered(people, names or ())
     said = [
@@ -68,25 +61,20 @@ def _name(image: Element) -> str:
     return plain_name(image.get("name", image.get("id", "")))
 
 
-def _track(who: str) -> str | None:
-    """A track's number; who is only counted in a picture may be another one in the next."""
-    return None if who.startswith("#") else who or None
-
-
-def _shapes(root: Element) -> Iterator[tuple[Key, str, Element, bool]]:
+def _shapes(root: Element) -> Iterator[tuple[Key, str | None, Element, bool]]:
     """The frame, the person, the skeleton or point, and whether it is out of the picture."""
     for image in root.iter("image"):
         for index, element in enumerate(image):
             if element.tag in ("skeleton", "points"):
                 said = element.find("attribute[@name='track_id']")
                 who = f"#{index}" if said is None else said.text or f"#{index}"
-                yield _name(image), who if _is_person(element) else _ALONE, element, False
+                yield _name(image), who if _is_person(element) else None, element, False
     for track in root.iter("track"):
         for element in track:
             if element.tag in ("skeleton", "points"):
                 if element.tag == "points" and "label" not in element.attrib:
                     element.set("label", track.get("label", ""))
-                who = track.get("id", "0") if _is_person(element) else _ALONE
+                who = track.get("id", "0") if _is_person(element) else None
                 place = element.get("frame", "")
                 if not place.isdecimal():
                     raise KeypointError(f"track {who}: expected a frame's number, found {place!r}")

@@ -6,12 +6,11 @@ Rows `joint, u, v[, confidence]` are the usual CSV of one. Missing joints have c
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
+from functools import partial
 from types import MappingProxyType
 
 from torchcss.errors import KeypointError
-from torchcss.files import StrPath, load_json
+from torchcss.files import StrPath
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.one_person import Whom
@@ -43,24 +42,8 @@ def read_joints(
     Raises:
         KeypointError: If the file is missing, damaged or of unknown format.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".json":
-        frame = _frame_of_single_image(load_json(path, KeypointError), frame)
-    whom = Whom(frame, "prominent", image_size_wh)
-    return read_person(
-        path, film=Film(None, None, None), whom=whom, layout=layout, normalised=normalised,
-        links=links,
-    ).at(frame)  # fmt: skip
-
-
-def _frame_of_single_image(content: object, otherwise: int) -> int:
-    """Where the joints of a file of one image are; COCO's number counts as a video's frame."""
-    if isinstance(content, dict):
-        return 0 if content.keys() & {"joints", "people", "landmarks"} else otherwise
-    rows = content if isinstance(content, list) else []
-    if rows and isinstance(rows[0], dict) and {"x", "y"} <= set(rows[0]):
-        return 0
-    images = {str(row.get("image_id")) if isinstance(row, dict) else "" for row in rows}
-    only = images.pop() if len(images) == 1 else ""
-    digits = re.findall(r"[0-9]+", Path(only).stem)
-    return int(digits[-1]) if digits else otherwise
+    read = partial(read_person, path, layout=layout, normalised=normalised, links=links)
+    try:
+        return read(film=Film(1), whom=Whom(0, "prominent", image_size_wh)).at(0)
+    except KeypointError:  # not of one picture
+        return read(film=Film(), whom=Whom(frame, "prominent", image_size_wh)).at(frame)
