@@ -316,16 +316,17 @@ class BodyModel(nn.Module):
             link: Link of each point.
             offset: Position in that link's frame, metres.
         """
-        turned = (tree.rotation[..., link, :, :] * offset[..., None, :]).sum(-1)
-        return turned + tree.translation[..., link, :]
+        turned = _turned(tree.rotation.index_select(-3, link), offset)
+        return turned + tree.translation.index_select(-2, link)
 
     def part_poses(
         self, pose: BodyPose
     ) -> tuple[Float[Tensor, "*batch parts 3 3"], Float[Tensor, "*batch parts 3"]]:
         """World orientation and centre of every part."""
-        rotation = pose.tree.rotation[..., self.part_link, :, :]
-        centre = (rotation * self.part_translation[:, None, :]).sum(-1)
-        return rotation @ self.part_rotation, centre + pose.tree.translation[..., self.part_link, :]
+        rotation = pose.tree.rotation.index_select(-3, self.part_link)
+        centre = _turned(rotation, self.part_translation)
+        base = pose.tree.translation.index_select(-2, self.part_link)
+        return rotation @ self.part_rotation, centre + base
 
     def mesh(self, rings: int = 8, meridians: int = 12) -> SurfaceSample:
         """Nodes and normals of all parts in their own frames, `[parts rings meridians 3]`.
@@ -413,6 +414,15 @@ class BodyModel(nn.Module):
         return LocalModel(
             joints.value, joints.gradient @ self.tie, self.tie.T @ joints.hessian @ self.tie
         )
+
+
+def _turned(
+    rotation: Float[Tensor, "*batch p 3 3"], vector: Float[Tensor, "*#batch p 3"]
+) -> Float[Tensor, "*batch p 3"]:
+    """Vectors turned one by one; on a CPU several times faster than sums over products of three."""
+    x, y, z = rotation.unbind(-1)
+    a, b, c = vector[..., None].unbind(-2)
+    return x * a + y * b + z * c
 
 
 def _driver(joint: str, mimics: Mapping[str, tuple[str, float, float]]) -> tuple[str, float, float]:
