@@ -208,6 +208,11 @@ JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
          "scores": [[person(t)[:, 2].tolist()] for t in T]},
         (),
     ),
+    "scores of frames beside joints in a row, nobody in one": (
+        {"keypoints": [[person(t)[:, :2].ravel().tolist()] if t != 3 else [] for t in T],
+         "scores": [[person(t)[:, 2].tolist()] if t != 3 else [] for t in T]},
+        (3,),
+    ),
     "joints numbered from 100": (
         [
             {"frame": t, "keypoints": [

@@ -101,15 +101,19 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
 def scored(people: list[Any], around: Mapping[str, Any]) -> list[Any]:
     """People, or frames of them, whose joints are pairs, with what stands beside all as scores."""
     scores = first_of({k: each for k, each in around.items() if isinstance(each, list)}, SCORES)
-    first = people
-    while isinstance(first, list) and first and isinstance(first[0], list):
-        first = first[0]
-    if scores is None or len(first) != 2 or len(scores) != len(people) or not all(
-        isinstance(own, list) and isinstance(each, list) and len(own) == len(each)
-        for own, each in zip(scores, people, strict=True)
+    joint: Any = people
+    while isinstance(joint, list) and isinstance(next(filter(None, joint), None), list):
+        joint = next(filter(None, joint))
+    if scores is None or len(joint) == 3 or len(scores) != len(people):
+        return people
+    beside = [(each or [], own or []) for each, own in zip(people, scores, strict=True)]
+    if not all(
+        isinstance(each, list) and isinstance(own, list)
+        and len(each) in (len(own), 2 * len(own))  # pairs, or in a row
+        for each, own in beside
     ):  # fmt: skip
         return people
-    return [{"keypoints": k, "scores": s} for k, s in zip(people, scores, strict=True)]
+    return [{"keypoints": each, "scores": own} for each, own in beside]
 
 
 def key_of(entry: Mapping[str, Any], words: Sequence[str]) -> str | None:

@@ -52,6 +52,9 @@ _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 _NUMBER = re.compile(r"([-+]?[0-9.,]+([eE][-+]?[0-9]+)?|nan)$")
 _DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
 
+_HAND = ("joint", "u", "v", "confidence")
+"""The columns of a table that somebody typed."""
+
 _WHEN = (*words.FRAMES, *words.TIMES, *words.PICTURES)
 
 Row = tuple[int, list[str]]
@@ -123,8 +126,7 @@ def people_of_rows(rows: list[Row]) -> People:
         return People(people, None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
-    by_hand = columns.joint is not None and columns.frame is None
-    return People(people, names, report, first=first, by_hand=by_hand)
+    return People(people, names, report, first=first, by_hand=heading == [*_HAND])
 
 
 def _told(columns: _Columns, heading: Sequence[str]) -> list[str]:
@@ -232,11 +234,11 @@ def _by_hand(rows: list[Row]) -> list[Row]:
     lengths = {len(_ended(row)) for row in rows}
     if not lengths <= {1, 3, 4} or lengths == {1} or _NUMBER.match(above[0] or "0"):
         return rows
-    headed = words.plain_word(above[0]) in words.JOINT_WORDS and _PARTS.get(above[1].lower()) == 0
+    headed = above[0].lower() == "joint" and _PARTS.get(above[1].lower()) == 0
     if not headed and not all(not cell or _NUMBER.match(cell) for cell in above[1:]):
         return rows
     full = [(n, [*cells, "", ""][:4]) for n, cells in rows[headed:]]
-    return [(number, ["joint", "u", "v", "confidence"]), *full]
+    return [(number, [*_HAND]), *full]
 
 
 def _with_one_heading(rows: list[Row]) -> list[Row]:
