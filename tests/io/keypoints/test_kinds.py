@@ -292,6 +292,12 @@ def test_folders(tmp_path: Path, kind: str) -> None:
     assert any("5 of 6 frames" in line for line in found.report)
 
 
+def test_a_folder_that_holds_one_file_of_a_video(tmp_path: Path) -> None:
+    frames = [{"frame_id": t, "instances": [mmpose(t, person(t))]} for t in T]
+    write(tmp_path / "predictions" / "clip.json", frames)
+    check(read(tmp_path))
+
+
 def test_a_folder_with_folders_of_several_cameras(tmp_path: Path) -> None:
     for camera in ("a", "b"):
         write(tmp_path / camera / "0.json", {"people": []})

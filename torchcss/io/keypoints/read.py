@@ -35,6 +35,7 @@ By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -244,7 +245,7 @@ def _stacked(frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:
 
 def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
     if path.is_dir():
-        return _read_folder(path, image_size_wh)
+        return _read_folder(path, image_size_wh, num_frames)
     archive, mark, selection = str(path).rpartition("#")
     if mark and not path.exists():
         path = Path(archive)
@@ -276,15 +277,17 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
     return read_json(path, image_size_wh, num_frames)
 
 
-def _read_folder(path: Path, image_size_wh: Size) -> People:
-    """A file for every frame; or a folder of one camera's folder of them."""
-    if files_of(path, ".json"):
+def _read_folder(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
+    """A file for every frame, or one without a number; or one camera's folder of them."""
+    if files := files_of(path, ".json"):
+        if len(files) == 1 and not re.search("[0-9]", files[0].stem):
+            return read_json(files[0], image_size_wh, num_frames)
         return read_folder(path)
     if files_of(path, ".txt"):
         return read_labels(path, image_size_wh)
     folders = sorted(entry.name for entry in path.iterdir() if entry.is_dir())
     if len(folders) == 1:
-        return _read_folder(path / folders[0], image_size_wh)
+        return _read_folder(path / folders[0], image_size_wh, num_frames)
     raise KeypointError(
         "no JSON files in this folder; expected OpenPose's, EasyMocap's or YOLO's labels, "
         "one for every frame"
