@@ -262,7 +262,7 @@ class TrackingCost:
         bound = (self._bound(kind, view) for kind, views in kinds for view in views)
         names = dict.fromkeys(name for terms in bound for name, _ in terms)
         at, only = x.detach(), self.choice.only
-        return {name: replace(self, choice=only([name])).value(at) for name in names}
+        return {name: replace(self, choice=only([name]))._value(at) for name in names}
 
     def gradients(self, x: States) -> dict[str, States]:
         """Gradient of every term and prior by name, visibility and assignments held fixed."""
