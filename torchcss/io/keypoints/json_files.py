@@ -180,15 +180,11 @@ def _load(path: Path) -> Any:
 def _format_of(content: object) -> str:
     """The program that writes such files."""
     words: set[str] = set()
-    layer = [content]
+    layer: list[Any] = [content]
     for _ in range(5):
-        below: list[object] = []
-        for value in layer:
-            if isinstance(value, dict):
-                words |= value.keys()
-                value = list(value.values())
-            below += value[:3] if isinstance(value, list) else []
-        layer = below
+        words |= {key for each in layer if isinstance(each, dict) for key in each}
+        below = ([*each.values()] if isinstance(each, dict) else each for each in layer)
+        layer = [one for each in below if isinstance(each, list) for one in each[:3]]
     return next((name for word, name in _FORMATS.items() if word in words), "JSON")
 
 
