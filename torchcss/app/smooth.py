@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.app.view_files import FrameSelection, moments, open_view
+from torchcss.app.view_files import FrameSelection, moments, open_run
 from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import StrPath, prepare_output_folder
@@ -225,12 +225,7 @@ def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
             f"known; give {', '.join(missing)}"
         )
     first, stop = int(track.frames[0]), int(track.frames[-1]) + 1
-    selection = FrameSelection(start=first, stop=stop)
-    views = [
-        open_view(each.files, each.camera, selection, run.body.joint_of_name)
-        for each in run.cameras
-        if each.files is not None
-    ]
+    views = open_run(run, FrameSelection(start=first, stop=stop))
     return smooth_frames(
         track,
         moments(views, set(track.frames.tolist())),

@@ -24,7 +24,7 @@ from torchcss.app.init import initialise_video
 from torchcss.app.lens import PERSONS, KnownLens, fitted
 from torchcss.app.lock import locked
 from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
-from torchcss.app.view_files import FrameSelection, OpenView, moments, open_view
+from torchcss.app.view_files import FrameSelection, OpenView, moments, open_run, open_view
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
@@ -347,10 +347,7 @@ def _go_on(
     assert checkpoint is not None
     _check_same(run, settings, selection, checkpoint.notes["extra"]["frames_selected"])
     _detect_further(run, selection, options)
-    links = run.body.joint_of_name
-    views = [
-        open_view(each.files, each.camera, selection, links) for each in run.cameras if each.files
-    ]
+    views = open_run(run, selection)
     body = run.body.to(dtype=settings.torch_dtype, device=settings.device)
     state = state_from_tensors(checkpoint.tensors, body)
     interval = selection.stride / float(views[0].reader.info.frame_rate)

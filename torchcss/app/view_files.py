@@ -24,6 +24,7 @@ from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
+from torchcss.io.run import Run
 from torchcss.io.video import VideoReader, missing_numbers, several_kinds
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.types import Frame, Keypoints, frozen
@@ -202,6 +203,14 @@ def open_view(
     sigma = files.sigma or keypoints.relative_noise * typical_sigma(keypoints)
     keypoints = read_points(files.keypoints, keypoints._replace(relative_noise=1.0))
     return OpenView(files, reader, masks, loaded, keypoints, sigma)
+
+
+def open_run(run: Run, selection: FrameSelection) -> list[OpenView]:
+    """Open the files of a run's cameras, see `open_view`."""
+    links = run.body.joint_of_name
+    return [
+        open_view(each.files, each.camera, selection, links) for each in run.cameras if each.files
+    ]
 
 
 def _keypoints(files: ViewFiles, reader: VideoReader, start: int, links: Links) -> Keypoints:
