@@ -828,6 +828,6 @@ def test_pixels_that_are_not_square_are_told(tmp_path: Path) -> None:
         container.mux(stream.encode())
     reader = VideoReader(path)
     assert reader.pixel_aspect == Fraction(16, 11)
-    lens = KnownLens(focal=100.0).camera(path)
+    lens = KnownLens(focal=100.0).camera(64, 48)
     notes = OpenView(ViewFiles(video=path, keypoints=None), reader, None, lens, None, 1.0).notes
     assert any("1.45 times as wide as high" in note for note in notes)
