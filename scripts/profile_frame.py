@@ -75,8 +75,8 @@ REASONS = {
         "of a warped picture), so that wide registers do not help."
     ),
     "planning steps": (
-        "Half is the copy of the state and calls; rows of a factor are 34 numbers and fewer, "
-        "five registers."
+        "Rows of a factor are 34 numbers and fewer, five registers; what is not in the kernel is "
+        "calls."
     ),
     "covariances of modes": (
         "LAPACK's eigenvectors of the modes whose Hessian is less curved than the prior "
@@ -91,8 +91,8 @@ REASONS = {
         "kilobytes, 3 to 5 µs each, nearly none of it arithmetic."
     ),
     "the best mode's terms": (
-        "One state in nine calls of the engine, one a term, 0.25 ms each, most of it packing; "
-        "and a drawing of the body for its colours."
+        "One state in a call of the engine for each of eight terms, 0.2 ms each, most of it "
+        "packing; and a drawing of the body for its colours."
     ),
     "learning colours": "Masks of eleven layers, and a drawing of the body and of its core.",
 }
