@@ -19,6 +19,7 @@ Units are metres, radians, seconds, pixels (pixel centres at integers) and nats.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import NamedTuple, Protocol, Self, TypeVar, dataclass_transform
@@ -186,6 +187,29 @@ class CostFunction(Differentiable, Protocol):
     def take(self, items: Items) -> CostFunction:
         """The cost of some items of the batch; itself, where all items have the same cost."""
         ...
+
+
+class BlendedCost(ABC):
+    """A `CostFunction` with a Hessian that is positive far from the minimum, and exact at it.
+
+    A cost says that it is one by being derived from this: the optimiser looks for no method.
+    """
+
+    @abstractmethod
+    def value(self, x: Vectors) -> Numbers:
+        """Cost in nats; a pure function of `x`."""
+
+    @abstractmethod
+    def local_model(self, x: Vectors) -> LocalModel:
+        """Cost, gradient and exact Hessian at `x`."""
+
+    @abstractmethod
+    def blended_model(self, x: Vectors, share: Numbers) -> LocalModel:
+        """Cost, gradient and a share, 0 to 1, of the second-order parts of the Hessian."""
+
+    @abstractmethod
+    def take(self, items: Items) -> CostFunction:
+        """The cost of some items of the batch."""
 
 
 class Keypoints(NamedTuple):

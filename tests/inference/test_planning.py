@@ -96,9 +96,10 @@ def check_twins(monkeypatch: pytest.MonkeyPatch, tolerance: float) -> list[Tenso
     """
     compiled, seen = TrustRegionNewton._advance_compiled, []
 
-    def both(self, state, *given):
-        expected = self._advance(TrustRegionState.of([p.clone() for p in state.tensors]), *given)
-        got = compiled(self, state, *given)
+    def both(self, state, trial, bounds, weight):
+        own = TrustRegionState.of([part.clone() for part in state.tensors])
+        expected = self._advance(own, trial, bounds, weight)
+        got = compiled(self, state, trial, bounds, weight)
         seen.append(alike(fields(got[0]), fields(expected[0]), tolerance))
         assert torch.equal(got[1].accepted, expected[1].accepted)
         assert bool(alike(got[1][1:], expected[1][1:], tolerance).all())
@@ -183,13 +184,14 @@ def test_an_item_depends_on_no_other(generator):
     assert bool(start.model.value.isinf().all()), "a step leaves the state before as it is"
     for _ in range(6):
         x = bounds.project(state.x + state.step)
-        model = cost.local_model(x)
+        model, share = cost.local_model(x), torch.ones(len(x)).double()
+        trial = trust_region._Trial(x, model, share, torch.inf)
         own = state.take(torch.arange(len(x)))
-        whole, _ = NEWTON._advance_compiled(own, x, model, bounds, weight)
+        whole, _ = NEWTON._advance_compiled(own, trial, bounds, weight)
         for items in (torch.arange(40).flip(0), torch.tensor([17]), torch.arange(5, 29, 3)):
             model_of = LocalModel(*(part[items] for part in model))
-            part = state.take(items)
-            some, _ = NEWTON._advance_compiled(part, x[items], model_of, bounds, weight)
+            part = trust_region._Trial(x[items], model_of, share[items], torch.inf)
+            some, _ = NEWTON._advance_compiled(state.take(items), part, bounds, weight)
             assert all(map(torch.equal, fields(some), fields(whole.take(items))))
         state = whole
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.forward_ad import unpack_dual
 
@@ -220,9 +220,9 @@ class KinematicTree(nn.Module):
         if _plain(base) is not None and (values := _plain(flat)) is not None:
             posed = self._pose_links(values, base)
             return TreePose(*(torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in posed))
-        frames = self._frames(flat, base)
+        frames = self.frames(flat, base)
         links = _followed_by(frames[self.link_place], self.link_constant)
-        parts = (links[:, :, :3], links[:, :, 3], *self._twists(frames))
+        parts = (links[:, :, :3], links[:, :, 3], *self.twists(frames))
         return TreePose(
             *(p.movedim(-1, 0).unflatten(0, batch) if batch else p[..., 0] for p in parts)
         )
@@ -241,10 +241,16 @@ class KinematicTree(nn.Module):
         run(pose_links, q, arrays, np.empty((1 + n, 3, 4), q.dtype), *parts)
         return parts
 
-    def _frames(
-        self, q: Float[Tensor, "b q"], base: Float[Tensor, "3 4"]
+    def frames(
+        self,
+        q: Float[Tensor, "b q"],
+        base: Float[Tensor, "3 4"],
     ) -> Float[Tensor, "frames 3 4 b"]:
-        """Axes and origin (the columns) of the base and of all moving joints, by depth."""
+        """Axes and origin (the columns) of the base and of all moving joints, by depth.
+
+        With `twists` and `points` this is what a cost of few points needs, without the poses of all
+        links; the batch is innermost. For the arguments see `forward`.
+        """
         q = q.T[self.joint_order].contiguous()
         revolute = self.is_revolute[self.joint_order, None]
         angle, slide = torch.where(revolute, q, 0.0), torch.where(revolute, 0.0, q)[:, None, None]
@@ -265,7 +271,13 @@ class KinematicTree(nn.Module):
             levels.append(frames)
         return torch.cat(levels)
 
-    def _twists(
+    def at_base(self, frames: Float[Tensor, "frames 3 4 b"]) -> TreePose:
+        """The tree with the base in place of all links, from `frames`: enough for the lift."""
+        # The lift needs no more of the links than a place near the body.
+        parts = (frames[:1, :, :3], frames[:1, :, 3], *self.twists(frames))
+        return TreePose(*(part.movedim(-1, 0) for part in parts))
+
+    def twists(
         self, frames: Float[Tensor, "frames 3 4 b"]
     ) -> tuple[Float[Tensor, "q 3 b"], Float[Tensor, "q 3 b"]]:
         """Angular and linear parts of the joints' twists in the world, from `frames`."""
@@ -276,6 +288,23 @@ class KinematicTree(nn.Module):
         moment = torch.stack([b * z - c * y, c * x - a * z, a * y - b * x], dim=1)
         revolute = self.is_revolute[:, None, None]
         return torch.where(revolute, axis, 0.0), torch.where(revolute, moment, axis)
+
+    def points(
+        self,
+        frames: Float[Tensor, "frames 3 4 b"],
+        link: Int[Tensor, " p"],
+        offset: Float[Tensor, "p 3"],
+    ) -> Float[Tensor, "p 3 b"]:
+        """World positions of points that are fixed in links, from `frames`.
+
+        Args:
+            frames: From `frames`.
+            link: Link of each point.
+            offset: Position in that link's frame, metres.
+        """
+        constant = self.link_constant[link]
+        place = (constant[:, :, :3] * offset[:, None, :]).sum(-1) + constant[:, :, 3]
+        return _followed_by(frames[self.link_place[link]], place[:, :, None])[:, :, 0]
 
 
 def _plain(q: Tensor) -> np.ndarray | None:

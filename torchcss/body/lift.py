@@ -41,7 +41,7 @@ def lift_to_joints(
     point_link: Int[Tensor, " p"],
     cost: PointCost,
     *,
-    second_order_kinematics: bool = True,
+    second_order_kinematics: bool | Float[Tensor, "*batch"] = True,
 ) -> LocalModel:
     """Sum a cost over points and differentiate it with respect to the joint values.
 
@@ -51,7 +51,8 @@ def lift_to_joints(
         points: World positions of the points, metres.
         point_link: The link that carries each point.
         cost: Value, gradient and Hessian of each point's cost in its world position.
-        second_order_kinematics: False leaves the curvature of the kinematics out (eq. 9 [RR]).
+        second_order_kinematics: False leaves the curvature of the kinematics out (eq. 9 [RR]); a
+            tensor scales it item by item.
 
     Returns:
         The cost summed over points, its gradient and its Hessian in the joints.
@@ -76,6 +77,8 @@ def lift_to_joints(
     per_joint = (below @ features).unflatten(1, (33, batch.numel()))
 
     twist = (*_components(pose.omega), *_components(velocity))
+    if isinstance(second_order_kinematics, Tensor):
+        second_order_kinematics = second_order_kinematics.reshape(batch.numel())
     gradient, reaction = reactions(per_joint.unbind(1), twist, second_order_kinematics)
     left = torch.stack(twist).permute(2, 1, 0).contiguous()
     right = torch.stack(reaction).permute(2, 0, 1).contiguous()
@@ -117,7 +120,7 @@ def point_moments(
 
 
 def reactions(
-    sums: Sequence[Tensor], twist: Sequence[Tensor], second_order_kinematics: bool = True
+    sums: Sequence[Tensor], twist: Sequence[Tensor], second_order_kinematics: bool | Tensor = True
 ) -> tuple[Tensor, list[Tensor]]:
     """How the points below joints react to their twists.
 
@@ -148,14 +151,18 @@ def reactions(
         _dot((mxy, myy, mzy, sxy, syy, syz), twist),
         _dot((mxz, myz, mzz, sxz, syz, szz), twist),
     ]
-    if not second_order_kinematics:
+    if second_order_kinematics is False:
         return gradient, turning + shifting
     curvature = [
         _dot((pxy, pxz, -pyy - pzz, fz, -fy), (wy, wz, wx, vy, vz)),
         _dot((pyx, pyz, -pxx - pzz, fx, -fz), (wx, wz, wy, vz, vx)),
         _dot((pzx, pzy, -pxx - pyy, fy, -fx), (wx, wy, wz, vx, vy)),
     ]
-    turning = [a + b for a, b in zip(turning, curvature, strict=True)]
+    if isinstance(second_order_kinematics, Tensor):
+        share = second_order_kinematics
+        turning = [torch.addcmul(a, share, b) for a, b in zip(turning, curvature, strict=True)]
+    else:
+        turning = [a + b for a, b in zip(turning, curvature, strict=True)]
     return gradient, turning + shifting
 
 

@@ -26,12 +26,13 @@ _NON_FINITE = int(Status.NON_FINITE)
 
 
 class Points(NamedTuple):
-    """States, and what the cost is there: value, gradient and Hessian."""
+    """States, and what the cost is there: value, gradient, Hessian and its second-order share."""
 
     x: Array
     value: Array
     gradient: Array
     hessian: Array
+    share: Array
 
 
 class Items(NamedTuple):
@@ -59,6 +60,7 @@ class Rules(NamedTuple):
     """The attributes of `TrustRegionNewton`, in the precision of the states, and limits."""
 
     tolerance: float
+    greatest_radius: float
     factorisations: int
     pinning_rounds: int
     max_steps: int
@@ -162,7 +164,8 @@ def _judge(
     items.num_steps[b] += 1
     if predicted != 0.0:
         length = _norm(items.step[b], space.weight)
-        items.radius[b] = _next_radius(items.radius[b], length, decrease / predicted, accepted)
+        after = _next_radius(items.radius[b], length, decrease / predicted, accepted)
+        items.radius[b] = min(after, rules.greatest_radius)
         shrinks = not accepted or items.radius[b] < length
         fell_short = shrinks and predicted < rules.tolerance
     if accepted:
@@ -170,7 +173,7 @@ def _judge(
         after = _norm(trial.gradient[b], space.inverse)
         if after < before:
             items.damping[b] *= after / before
-        at.value[b] = trial.value[b]
+        at.value[b], at.share[b] = trial.value[b], trial.share[b]
         for i in range(at.x.shape[1]):
             at.x[b, i], at.gradient[b, i] = trial.x[b, i], trial.gradient[b, i]
             for j in range(at.x.shape[1]):
@@ -232,10 +235,11 @@ def _plan(
     converged = predicted < rules.tolerance and damping <= floor
     ends = converged or fell_short or predicted <= 4.0 * _epsilon(damping) * abs(at.value[b])
     items.damping[b] = damping
-    items.predicted[b] = predicted
+    share = 0.0 if ends and at.share[b] != 1.0 else 1.0
+    items.predicted[b] = share * predicted
     for i in range(len(step)):
-        items.step[b, i] = step[i]
-    if ends:
+        items.step[b, i] = share * step[i]
+    if ends and at.share[b] == 1.0:
         items.status[b] = _CONVERGED if converged else _SMALL_STEP
     elif items.num_steps[b] >= rules.max_steps:
         items.status[b] = _STEP_LIMIT

@@ -65,6 +65,7 @@ from torchcss.linalg import (
     wall,
 )
 from torchcss.types import (
+    BlendedCost,
     Bounds,
     CostFunction,
     Items,
@@ -92,17 +93,19 @@ class TrustRegionState(NamedTuple):
     Attributes:
         x: Current states, admissible.
         model: Cost and derivatives there; the cost of an item not evaluated yet is `inf`.
+        share: Which share of the second-order parts the model's Hessian contains; 1 is exact.
         radius: Trust radius, in units of `scale`.
         damping: `lambda` of eq. 13 for the coming step.
         step: The coming step; it stays inside the bounds.
-        predicted: Decrease that the quadratic model predicts for it, nats; zero where `x` itself is
-            to be evaluated first.
+        predicted: Decrease that the quadratic model predicts for it, nats; zero where the next
+            evaluation is to be at `x` itself.
         status: A `Status` per item.
         num_steps: Iterations taken.
     """
 
     x: Vectors
     model: LocalModel
+    share: Numbers
     radius: Numbers
     damping: Numbers
     step: Vectors
@@ -137,10 +140,29 @@ class TrustRegionInfo(NamedTuple):
     decrease: Numbers
 
 
+class _Trial(NamedTuple):
+    """Where every item was evaluated, and what the cost is there.
+
+    Attributes:
+        x: The states, admissible.
+        model: Cost and derivatives.
+        share: Which share of the second-order parts the Hessians contain.
+        greatest_radius: Bound on trust radii.
+    """
+
+    x: Vectors
+    model: LocalModel
+    share: Numbers
+    greatest_radius: float
+
+
 _PINNING_ROUNDS = 12
 """Solves that may be spent on finding which bounds a step ends at."""
 FLAT = 1e-9
 """Share of the trust radius below which a damped step counts as none: the slope is zero."""
+_FAST, _SLOW = 0.02, 0.005
+"""Share of the cost that a step must promise to remove for Gauss-Newton to be the better model, and
+below which the exact one is."""
 _POOL_SIZE = 1024
 """Items worked on at a time on a CPU."""
 _FACTOR_CHUNK = 128
@@ -184,6 +206,7 @@ class TrustRegionNewton:
         return TrustRegionState(
             x=x0.detach().clone(),
             model=LocalModel(zero + torch.inf, x0.new_zeros(b, n), x0.new_zeros(b, n, n)),
+            share=zero,
             radius=zero + self.initial_radius,
             damping=zero,
             step=x0.new_zeros(b, n),
@@ -224,17 +247,22 @@ class TrustRegionNewton:
         if scale is not None:
             weight = scale.to(state.x).square().reciprocal()
         candidate = bounds.project(state.x + state.step)
-        model = _checked(cost.local_model(candidate), candidate)
-        advance = self._advance_compiled if _is_compiled(candidate) else self._advance
-        return advance(state, candidate, model, bounds, weight)
+        greatest_radius = torch.inf
+        if isinstance(cost, BlendedCost):
+            greatest_radius = self.initial_radius
+            share = _share_of_second_order(state.model.value, state.predicted)
+            model = cost.blended_model(candidate, share)
+        else:
+            share = torch.ones_like(state.radius)
+            model = cost.local_model(candidate)
+        model = _checked(model, candidate)
+        trial = _Trial(candidate, model, share, greatest_radius)
+        if _is_compiled(candidate):
+            return self._advance_compiled(state, trial, bounds, weight)
+        return self._advance(state, trial, bounds, weight)
 
     def _advance_compiled(
-        self,
-        state: TrustRegionState,
-        candidate: Vectors,
-        model: LocalModel,
-        bounds: Bounds,
-        weight: Vector,
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
         """The same as `_advance` in one compiled call, and in the memory of the state."""
         from torchcss.inference import planning  # compiled: only where it is used
@@ -246,11 +274,12 @@ class TrustRegionNewton:
         real: Any = np.float32 if state.x.dtype == torch.float32 else np.float64
         run(
             planning.advance,
-            planning.Items(planning.Points(*arrays[:4]), *arrays[4:]),
-            planning.Points(*map(_array, (candidate, *model))),
+            planning.Items(planning.Points(*arrays[:5]), *arrays[5:]),
+            planning.Points(*map(_array, (trial.x, *trial.model, trial.share))),
             planning.Space(*map(_array, (*bounds, weight, weight.reciprocal()))),
             planning.Rules(
                 tolerance=real(self.tolerance),
+                greatest_radius=real(trial.greatest_radius),
                 factorisations=self.factorisations,
                 pinning_rounds=_PINNING_ROUNDS,
                 max_steps=self.max_steps,
@@ -261,14 +290,10 @@ class TrustRegionNewton:
         return state, info
 
     def _advance(
-        self,
-        state: TrustRegionState,
-        candidate: Vectors,
-        model: LocalModel,
-        bounds: Bounds,
-        weight: Vector,
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
-        """Keep the candidates that lower the cost, and plan the next steps."""
+        """Keep the trials that lower the cost, and plan the next steps."""
+        candidate, model, share, greatest_radius = trial
         running, value = state.status == Status.RUNNING, state.model.value
         finite = _is_finite(model) & candidate.isfinite().all(-1)
         decrease = torch.where(finite, value - model.value, -torch.inf)
@@ -276,7 +301,7 @@ class TrustRegionNewton:
         ratio = decrease / torch.where(stays, 1.0, state.predicted)
         accepted = running & finite & (stays | ((decrease >= 0) & (ratio > LEAST_RATIO)))
         length = _norm(state.step, weight)
-        radius = _next_radius(state.radius, length, ratio, accepted)
+        radius = _next_radius(state.radius, length, ratio, accepted).clamp(max=greatest_radius)
         unusable = running & value.isinf() & ~accepted
         fell_short = ~stays & (~accepted | (radius < length)) & (state.predicted < self.tolerance)
         state = TrustRegionState(
@@ -286,6 +311,7 @@ class TrustRegionNewton:
                 torch.where(accepted[:, None], model.gradient, state.model.gradient),
                 torch.where(accepted[:, None, None], model.hessian, state.model.hessian),
             ),
+            share=torch.where(accepted, share, state.share),
             radius=torch.where(running & ~stays, radius, state.radius),
             damping=state.damping * _change_of_damping(state, model, accepted, weight),
             step=state.step,
@@ -445,12 +471,16 @@ class TrustRegionNewton:
         converged = (predicted < self.tolerance) & (damping <= floor)
         # A short damped step that keeps its promise is progress along a curved valley, not an end.
         futile = fell_short | (predicted <= 4 * torch.finfo(x.dtype).eps * model.value.abs())
+        # No item ends on a model that is not exact: it is evaluated once more where it stands.
+        ends = running & (converged | futile)
+        exact = state.share == 1
+        again = ends & ~exact
         reason = torch.where(converged, int(Status.CONVERGED), int(Status.SMALL_STEP))
         return state._replace(
-            step=torch.where(running[:, None], step, state.step),
+            step=torch.where(running[:, None], torch.where(again[:, None], 0.0, step), state.step),
             damping=torch.where(running, damping, state.damping),
-            predicted=torch.where(running, predicted, state.predicted),
-            status=torch.where(running & (converged | futile), reason, state.status),
+            predicted=torch.where(running, torch.where(again, 0.0, predicted), state.predicted),
+            status=torch.where(ends & exact, reason, state.status),
         )
 
 
@@ -749,3 +779,14 @@ def _is_compiled(x: Tensor) -> bool:
 def _array(tensor: Tensor) -> np.ndarray:
     """The same memory, where it is contiguous: other layouts round differently."""
     return tensor.detach().contiguous().numpy()
+
+
+def _share_of_second_order(value: Numbers, predicted: Numbers) -> Tensor:
+    """How much of the second-order parts the model at the next candidate is to contain.
+
+    None as long as the step promises to remove a good part of what the cost can fall by, all of
+    it near the end (after Fletcher and Xu 1987, who decide by the decrease that was had).
+    """
+    promise = predicted / torch.where(value > 0, value, 1.0)
+    exact = (_FAST - promise) / (_FAST - _SLOW)
+    return torch.where(value.isinf(), 0.0, exact.clamp(0, 1))
