@@ -5,8 +5,7 @@
 One reprojection problem (`torchcss.studies.reprojection`: 34 parameters, 22 joints in one image,
 sticky priors, joint limits) is descended from random starts by
 
-* `torchcss`: `TrustRegionNewton` on the tracker's cost of keypoints and priors, both compiled where
-  numba is;
+* `torchcss`: `TrustRegionNewton` on the closed-form cost, both compiled where numba is;
 * `torchcss, torch cost`: the same on the cost in torch;
 * `scipy trf`: `scipy.optimize.least_squares` with bounds and an analytic Jacobian;
 * `scipy L-BFGS-B`, which gets value and gradient;
@@ -23,8 +22,8 @@ of the clock and, steadier on a busy machine, per second of processor time on on
 A start counts as converged if the largest entry of the projected gradient fell to a millionth of
 the start's. Ours gets a tolerance that reaches this, which takes it half a step more; the peers
 keep theirs: SciPy its defaults, JAX a promised decrease of 1e-6 nats. The Lorentzian is so flat far
-out that a millionth of the slope there is a strict measure. Costs are those of `torchcss` at
-the states returned.
+out that a millionth of the slope there is a strict measure. Costs are those of `ReprojectionCost`
+at the states returned.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ import importlib.util
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
@@ -47,12 +46,15 @@ os.environ.setdefault(
 import numpy as np
 import torch
 from common import Table, start, write_report
+from peers.compiled_reprojection import CompiledReprojection
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.kernels import compiler
 from torchcss.linalg import covariance_factor
-from torchcss.studies.reprojection import ReprojectionProblem, StudyChoice, study_problem
+from torchcss.robust import Lorentzian, Quadratic
+from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
 
 OURS, EAGER = "torchcss", "torchcss, torch cost"
 TRF, LBFGS, JAX, COMPACTED = "scipy trf", "scipy L-BFGS-B", "jax", "jax compacted"
@@ -101,11 +103,13 @@ class Config:
 
 
 def make_problem(config: Config) -> ReprojectionProblem:
-    choice = StudyChoice(
-        pixel_noise=config.pixel_noise, robust=config.potential == "lorentzian", all_joints=True
+    robust = Lorentzian(nu=8.0, sigma=8.0**0.5)
+    return reprojection_problem(
+        config.body,
+        generator=torch.Generator().manual_seed(config.seed),
+        pixel_noise=config.pixel_noise,
+        potential=Quadratic() if config.potential == "quadratic" else robust,
     )
-    generator = torch.Generator().manual_seed(config.seed)
-    return study_problem(config.body, generator=generator, choice=choice)
 
 
 def make_starts(config: Config, problem: ReprojectionProblem) -> Tensor:
@@ -126,7 +130,8 @@ def make_solver(config: Config, problem: ReprojectionProblem, name: str) -> Any:
     """A function from starts to states and iterations."""
     if name in (OURS, EAGER):
         newton = TrustRegionNewton(max_steps=200, tolerance=1e-12, initial_radius=config.radius)
-        cost = problem.cost if name == OURS else replace(problem.cost, engine=None)
+        compiled = name == OURS and compiler.AVAILABLE
+        cost = CompiledReprojection.of(problem.cost) if compiled else problem.cost
 
         def ours(x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             modes = newton.minimise(cost, torch.from_numpy(x0), problem.bounds)
@@ -136,10 +141,10 @@ def make_solver(config: Config, problem: ReprojectionProblem, name: str) -> Any:
     if name in (JAX, COMPACTED):
         from peers.jax_lm import JaxLevenbergMarquardt
 
-        return JaxLevenbergMarquardt(problem, compacted=name == COMPACTED)
+        return JaxLevenbergMarquardt(problem.cost, compacted=name == COMPACTED)
     from peers.numpy_problem import NumpyProblem
 
-    peer = NumpyProblem(problem)
+    peer = NumpyProblem(problem.cost)
     return lambda x0: peer.solve(x0, "trf" if name == TRF else "L-BFGS-B")
 
 

@@ -2,7 +2,7 @@
 
     python scripts/sampler_slices.py --out slices/
 
-The slice goes through the start mode of a reprojection problem (`torchcss.studies.reprojection`),
+The slice goes through the start mode of a reprojection problem (`torchcss.studies.sampling_study`),
 along two eigen-directions of its covariance. On an arm, the most uncertain one leads to the other
 minimum of a forward-backward flip. In the slice, (1) CONDENSATION randomises the mode by dynamical
 noise, (2) the multiple-hypothesis tracker of Cham and Rehg samples the mode's covariance and adds
@@ -33,7 +33,7 @@ from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScale
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.linalg import squared_mahalanobis
-from torchcss.studies.reprojection import StudyChoice, study_problem
+from torchcss.studies.sampling_study import StudyChoice, study_problem
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
 CHOICE = StudyChoice(pixel_noise=2.0, prior_scale=3.0)

@@ -13,7 +13,7 @@ Hessian is taken on the parameters that no limit holds, with no cap on its width
 | floored | share of the frames in which some mode's Hessian was given a least curvature |
 
 Numbers are medians over the frames, then over the seeds. The same is said of the cost of joints in
-one image (section 7 [IJRR], `torchcss.studies.reprojection`) for the paper's bodies, of 8 and 32
+one image (section 7 [IJRR], `torchcss.studies.sampling_study`) for the paper's bodies, of 8 and 32
 parameters, at a start mode of each of `--poses` seeds.
 """
 
@@ -35,8 +35,7 @@ from torchcss.inference.trust_region import default_prior_variance
 from torchcss.io.video import VideoReader
 from torchcss.linalg import constrained_inverse
 from torchcss.studies.comparison import find_start, session_of
-from torchcss.studies.reprojection import study_problem
-from torchcss.studies.sampling_study import spectrum
+from torchcss.studies.sampling_study import spectrum, study_problem
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 
 TRACKING = Settings(preset="ijrr_css", overlay=False)

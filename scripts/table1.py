@@ -36,13 +36,15 @@ from torchcss.files import load_json, real_numbers
 from torchcss.inference.proposals import CovarianceScaled, Spherical
 from torchcss.io.tracks import prepare_output_folder
 from torchcss.show.style import OKABE_ITO
-from torchcss.studies.reprojection import ReprojectionProblem, StudyChoice, study_problem
+from torchcss.studies.reprojection import ReprojectionProblem
 from torchcss.studies.sampling_study import (
     Lengths,
     SamplerRun,
+    StudyChoice,
     num_shared,
     run_sampler,
     spectrum,
+    study_problem,
 )
 
 COLUMNS = {
@@ -109,6 +111,8 @@ class Config:
     """Samples return to the limits along their covariance instead of each parameter for itself."""
     robust: bool = False
     """Lorentzian instead of quadratic reprojection error."""
+    exact_steps: bool = True
+    """Descents take exact Hessians throughout, which keeps them in the basin that they start in."""
     duplicate_distance: float = 1.0
     """Minima closer than this many standard deviations are one; also counted at half and double."""
     cheap: float = 20.0
@@ -190,7 +194,7 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
                 problem, kind(deviation_scale=scale, include_modes=False,
                               correlated_projection=config.correlated_projection),
                 config.samples, generator=torch.Generator().manual_seed(1000 + seed),
-                distance=config.duplicate_distance,
+                distance=config.duplicate_distance, exact_steps=config.exact_steps,
             )  # fmt: skip
             row = {"method": method, "scale": scale, **row_of(config, run)}
             if method == "SS":

@@ -19,9 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from torchcss.cost.stabiliser import Stabiliser
 from torchcss.robust import Lorentzian, Quadratic
-from torchcss.studies.reprojection import ReprojectionProblem
+from torchcss.studies.reprojection import ReprojectionCost
 
 jax.config.update("jax_enable_x64", True)
 
@@ -47,10 +46,10 @@ class Items(NamedTuple):
 
 
 class JaxLevenbergMarquardt:
-    """Descends on one problem from many starts.
+    """Descends on one `ReprojectionCost` from many starts.
 
     Args:
-        problem: The problem.
+        cost: The problem; its stabiliser must not be None.
         max_steps: Iterations per item.
         tolerance: Predicted decrease, nats, below which an item is done.
         compacted: Whether finished items are dropped.
@@ -58,14 +57,14 @@ class JaxLevenbergMarquardt:
 
     def __init__(
         self,
-        problem: ReprojectionProblem,
+        cost: ReprojectionCost,
         *,
         max_steps: int = 200,
         tolerance: float = 1e-6,
         compacted: bool = True,
     ) -> None:
-        self.residuals = _make_residuals(problem)
-        self.lower, self.upper = (jnp.asarray(bound.numpy()) for bound in problem.bounds)
+        self.residuals = _make_residuals(cost)
+        self.lower, self.upper = (jnp.asarray(bound.numpy()) for bound in cost.body.bounds)
         self.max_steps, self.tolerance, self.compacted = max_steps, tolerance, compacted
         self.start = jax.jit(jax.vmap(self._start))
         self.block = jax.jit(jax.vmap(self._block if compacted else self._to_the_end))
@@ -140,24 +139,23 @@ def _padded(array: np.ndarray) -> np.ndarray:
     return np.concatenate([array, np.repeat(array[:1], size - len(array), axis=0)])
 
 
-def _make_residuals(problem: ReprojectionProblem):
+def _make_residuals(cost: ReprojectionCost):
     """A function of one state that returns residuals and their Jacobian."""
-    body, camera, noise = problem.body, problem.camera, problem.choice.pixel_noise
-    stabiliser = problem.cost.choice.find(Stabiliser)
-    assert stabiliser is not None
-    stabiliser_nu, seen = stabiliser.nu, body.joint_columns(problem.joint_names)
+    body, camera = cost.body, cost.camera
+    assert cost.stabiliser is not None
+    stabiliser_nu = cost.stabiliser.nu
     names = body.tree.joint_names
     turn = camera.R_camera_world.numpy()
     base = turn @ body.base_rotation.numpy()
     origin = turn @ body.base_translation.numpy() + camera.t_camera_world.numpy()
-    moves = body.tree.ancestors[:, body.marker_link[seen]].T.numpy()  # [j q]
-    links = [body.tree.link_names[k] for k in body.marker_link[seen]]
-    offsets = body.marker_offset[seen].numpy()
-    focal = camera.K.diagonal()[:2].numpy() / noise
-    shift = (camera.K[:2, 2] - problem.observed).numpy() / noise
-    far = np.array(camera.image_size_wh) / noise
+    moves = body.tree.ancestors[:, body.marker_link[cost.index]].T.numpy()  # [j q]
+    links = [body.tree.link_names[k] for k in body.marker_link[cost.index]]
+    offsets = body.marker_offset[cost.index].numpy()
+    focal = camera.K.diagonal()[:2].numpy() / cost.pixel_noise
+    shift = (camera.K[:2, 2] - cost.target).numpy() / cost.pixel_noise
+    far = np.array(camera.image_size_wh) / cost.pixel_noise
     mean, deviation = body.sticky_mean.numpy(), body.sticky_deviation.numpy()
-    potential = problem.choice.potential
+    potential = cost.potential
 
     def kinematics(x):
         """Points [j 3] and twists [q 3] in the camera's frame."""

@@ -14,27 +14,24 @@ import numpy as np
 import scipy.optimize
 import torch
 
-from torchcss.cost.stabiliser import Stabiliser
-from torchcss.studies.reprojection import ReprojectionProblem
+from torchcss.studies.reprojection import ReprojectionCost
 
 INSIDE = 1e-9
 """How far inside the limits a start of `least_squares` is moved; it refuses those on a limit."""
 
 
 class NumpyProblem:
-    """Residuals and derivatives of one problem.
+    """Residuals and derivatives of one `ReprojectionCost`; its stabiliser must not be None.
 
     Attributes:
         lower: Least admissible state.
         upper: Greatest admissible state.
     """
 
-    def __init__(self, problem: ReprojectionProblem) -> None:
-        body, camera, noise = problem.body, problem.camera, problem.choice.pixel_noise
-        stabiliser = problem.cost.choice.find(Stabiliser)
-        assert stabiliser is not None
+    def __init__(self, cost: ReprojectionCost) -> None:
+        body, camera = cost.body, cost.camera
+        assert cost.stabiliser is not None
         assert body.is_untied
-        seen = body.joint_columns(problem.joint_names)
         turn = camera.R_camera_world.numpy()
         base = np.eye(4)
         base[:3, :3] = turn @ body.base_rotation.numpy()
@@ -56,19 +53,19 @@ class NumpyProblem:
             self.joints.append((above, matrix, axis, joint.kind == "revolute", column))
         self.order = np.array([joint[4] for joint in self.joints])
         self.revolute = np.array([joint[3] for joint in self.joints])[:, None]
-        links = [body.tree.link_names[k] for k in body.marker_link[seen]]
-        homogeneous = np.c_[body.marker_offset[seen].numpy(), np.ones(len(links))]
+        links = [body.tree.link_names[k] for k in body.marker_link[cost.index]]
+        homogeneous = np.c_[body.marker_offset[cost.index].numpy(), np.ones(len(links))]
         self.carriers = np.array([carrier[link] for link in links])
         self.offsets = np.stack(
             [(fixed[link] @ point)[:3] for link, point in zip(links, homogeneous, strict=True)]
         )
-        moves = body.tree.ancestors[:, body.marker_link[seen]].numpy()
+        moves = body.tree.ancestors[:, body.marker_link[cost.index]].numpy()
         self.moves = moves.T[:, self.order, None]
-        self.potential, self.near = problem.choice.potential, camera.near
-        self.focal = camera.K.diagonal()[:2].numpy() / noise
-        self.shift = (camera.K[:2, 2] - problem.observed).numpy() / noise
-        self.far = np.array(camera.image_size_wh) / noise
-        self.mean, self.nu = body.sticky_mean.numpy(), stabiliser.nu
+        self.cost, self.near = cost, camera.near
+        self.focal = camera.K.diagonal()[:2].numpy() / cost.pixel_noise
+        self.shift = (camera.K[:2, 2] - cost.target).numpy() / cost.pixel_noise
+        self.far = np.array(camera.image_size_wh) / cost.pixel_noise
+        self.mean, self.nu = body.sticky_mean.numpy(), cost.stabiliser.nu
         self.inverse = 1 / body.sticky_deviation.numpy()
         self.lower, self.upper = (bound.numpy() for bound in body.bounds)
         self._posed_at = b""
@@ -158,7 +155,7 @@ class NumpyProblem:
         self.error = np.where(valid[:, None], error, self.far)
         # scale = sqrt(rho / s); d(scale e) = scale de + bend (e . de) e with bend = 2 d scale / ds.
         squared = (self.error**2).sum(1)
-        rho, first, _ = (part.numpy() for part in self.potential(torch.from_numpy(squared)))
+        rho, first, _ = (part.numpy() for part in self.cost.potential(torch.from_numpy(squared)))
         small = squared < 1e-12
         safe = np.where(small, 1, squared)
         self.scale = np.sqrt(np.where(small, first, rho / safe))

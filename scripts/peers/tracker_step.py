@@ -26,7 +26,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.studies.reprojection import StudyChoice, study_problem
+from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Keypoints, Status
 
 FRAME_INTERVAL = 1 / 25
@@ -85,9 +85,7 @@ def fused_step(dtype: Literal["float32", "float64"]) -> Step | None:
 def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[FrameData]:
     """Frame after frame: other keypoints, other modes, other draws, in the type of a tensor."""
     generator = torch.Generator().manual_seed(seed)
-    problem = study_problem(
-        body_name, generator=generator, choice=StudyChoice(pixel_noise=1.0, all_joints=True)
-    )
+    problem = reprojection_problem(body_name, generator=generator)
     body, camera = problem.body.to(like), problem.camera.to(like)
     factor = torch.linalg.cholesky(problem.start.covariance).to(like)
     factor = factor.expand(pool, -1, -1).contiguous()

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.robust import Lorentzian, Quadratic
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -67,10 +68,10 @@ def test_the_peers_have_our_cost(script: ModuleType, body: str, potential: str) 
 
     config = script.Config(body=body, potential=potential, starts=3, cores=1)
     problem = script.make_problem(config)
-    assert problem.choice.robust == (potential == "lorentzian")
+    assert isinstance(problem.cost.potential, Quadratic if potential == "quadratic" else Lorentzian)
     starts = script.make_starts(config, problem)[0]
     want = problem.cost.local_model(starts)
-    peer = NumpyProblem(problem)
+    peer = NumpyProblem(problem.cost)
     for i, x in enumerate(starts.numpy()):
         value, gradient = peer.value_and_gradient(x)
         assert value == pytest.approx(float(want.value[i]), rel=1e-9)
@@ -87,7 +88,7 @@ def test_jax_has_the_residuals_of_numpy(script: ModuleType, potential: str) -> N
 
     config = script.Config(body="arm8", potential=potential, starts=3, cores=1)
     problem = script.make_problem(config)
-    solver, peer = JaxLevenbergMarquardt(problem), NumpyProblem(problem)
+    solver, peer = JaxLevenbergMarquardt(problem.cost), NumpyProblem(problem.cost)
     x = script.make_starts(config, problem)[0, 0].numpy()
     residual, jacobian = solver.residuals(x)
     np.testing.assert_allclose(residual, peer.residuals(x), rtol=1e-9, atol=1e-9)

@@ -10,7 +10,7 @@ from peers.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, st
 from torch import Tensor
 
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.studies.reprojection import StudyChoice, study_problem
+from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Bounds, CostFunction, LocalModel
 
 REAL = torch.float64
@@ -97,8 +97,7 @@ def test_an_indefinite_matrix_is_damped_until_it_is_definite() -> None:
 
 
 def test_the_minima_are_those_of_the_optimiser(generator: torch.Generator) -> None:
-    sharp = StudyChoice(pixel_noise=1.0)
-    problem = study_problem("arm8", generator=generator, choice=sharp)
+    problem = reprojection_problem("arm8", generator=generator)
     noise = torch.randn(40, 8, generator=generator, dtype=REAL)
     x = problem.bounds.project(problem.start.mean + 0.3 * noise)
     state = iterate(problem.cost, start(x), problem.bounds, 100)
@@ -112,7 +111,7 @@ def test_the_minima_are_those_of_the_optimiser(generator: torch.Generator) -> No
 
 
 def test_items_do_not_influence_each_other(generator: torch.Generator) -> None:
-    problem = study_problem("arm8", generator=generator)
+    problem = reprojection_problem("arm8", generator=generator)
     noise = torch.randn(6, 8, generator=generator, dtype=REAL)
     x = problem.bounds.project(problem.start.mean + 0.3 * noise)
     broken = x.index_fill(0, torch.tensor([2]), math.nan)

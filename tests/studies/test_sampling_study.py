@@ -1,10 +1,18 @@
 import pytest
 import torch
 
+from torchcss.errors import BodyError
 from torchcss.inference.proposals import CovarianceScaled
-from torchcss.studies.reprojection import study_problem
-from torchcss.studies.sampling_study import depth_flips, num_shared, run_sampler, spectrum
-from torchcss.types import Status
+from torchcss.studies.sampling_study import (
+    ExactSteps,
+    StudyChoice,
+    depth_flips,
+    num_shared,
+    run_sampler,
+    spectrum,
+    study_problem,
+)
+from torchcss.types import BlendedCost, Status
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +31,30 @@ def test_the_start_is_a_minimum_near_the_truth(problem):
     assert float(problem.start.cost) < float(problem.cost.value(problem.truth[None]))
     expected = torch.linalg.eigvalsh(problem.start.covariance).sqrt().flip(0)
     torch.testing.assert_close(spectrum(problem.start.covariance), expected)
+
+
+def test_options_change_what_they_say(problem):
+    def other(pose: dict[str, float] | None = None, **options):
+        generator = torch.Generator().manual_seed(0)
+        return study_problem("arm8", generator=generator, choice=StudyChoice(**options), pose=pose)
+
+    torch.testing.assert_close(other().start.mean, problem.start.mean)
+    noisy = other(pixel_noise=6.0)
+    torch.testing.assert_close(noisy.truth, problem.truth)
+    ratio = float(spectrum(noisy.start.covariance)[-1] / spectrum(problem.start.covariance)[-1])
+    assert ratio == pytest.approx(2, rel=0.2)
+    capped = other(widest=0.1)
+    assert float(spectrum(capped.start.covariance)[0]) == pytest.approx(0.1, abs=1e-6)
+    loose = other(prior_scale=30.0, widest=3.0)
+    assert float(spectrum(loose.start.covariance)[0]) > float(spectrum(problem.start.covariance)[0])
+    assert bool(other(limits=False).bounds.upper.isinf().all())
+    far = problem.truth[None] + 0.5
+    assert float(other(robust=True).cost.value(far)) < 0.2 * float(problem.cost.value(far))
+    given = other(pose={"r_elbow_flexion": 1.0})
+    assert float(given.truth[given.body.state_index("r_elbow_flexion")]) == 1.0
+    assert float(given.cost.value(given.truth[None])) < 50
+    with pytest.raises(BodyError, match="no parameter 'elbow'; it has"):
+        other(pose={"elbow": 1.0})
 
 
 def test_a_run_sums_itself_up(problem, run):
@@ -67,3 +99,10 @@ def test_flips_are_named(problem):
     assert 0 < expected < 100
     assert depth_flips(problem, x)["r_forearm"] == expected
     assert "r_upper_arm" not in depth_flips(problem, x)
+
+
+def test_exact_steps_hide_nothing_else(problem):
+    cost = ExactSteps(problem.cost)
+    assert not isinstance(cost, BlendedCost)
+    x = problem.truth[None]
+    assert torch.equal(cost.value(x), problem.cost.value(x))

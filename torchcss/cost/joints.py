@@ -90,7 +90,7 @@ def _pairs(
     """Columns of keypoints that a body has, its joints, and their spread."""
     columns = [column for column, name in enumerate(names) if name in joint_names]
     joints = [joint_names.index(names[column]) for column in columns]
-    return columns, joints, [spread_of(names[column]) for column in columns]
+    return columns, joints, [_spread(names[column]) for column in columns]
 
 
 def _error(uv: Float[Tensor, "*batch m 2"], targets: JointTargets) -> Tensor:
@@ -98,8 +98,7 @@ def _error(uv: Float[Tensor, "*batch m 2"], targets: JointTargets) -> Tensor:
     return (uv - targets.position).clamp(-_FAR_PX, _FAR_PX)
 
 
-def spread_of(name: str) -> float:
-    """Spread of a joint's keypoint relative to a wrist's."""
+def _spread(name: str) -> float:
     return SPREAD.get(name, SPREAD.get(name.split("_", 1)[-1], 1.0))
 
 
