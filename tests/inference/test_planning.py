@@ -17,7 +17,7 @@ from torch import Tensor
 from torchcss.inference import trust_region
 from torchcss.inference.trust_region import TrustRegionNewton, TrustRegionState
 from torchcss.kernels import compiler
-from torchcss.studies.reprojection import study_problem
+from torchcss.studies.reprojection import reprojection_problem
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
 pytestmark = pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
@@ -59,7 +59,7 @@ def made(name: str, generator: torch.Generator) -> tuple[CostFunction, Tensor, B
     """A cost, starts, some of them awkward, and bounds."""
     a, inf = randn(7, 7, generator=generator), torch.inf
     if name == "body34":
-        problem = study_problem("body34", generator=generator)
+        problem = reprojection_problem("body34", generator=generator)
         x0 = problem.truth + 0.6 * randn(40, 34, generator=generator)
         return problem.cost, problem.bounds.project(x0), problem.bounds
     cost, n, width = {

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchcss.body.load import load_body
-from torchcss.body.model import differentiate_twice
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.term import differentiate_twice
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import BodyError, CameraError, ShapeError
 from torchcss.inference.trust_region import TrustRegionNewton, default_prior_variance

@@ -154,10 +154,10 @@ class ReprojectionCost(BlendedCost):
     def _pose(self, x: Float[Tensor, "b n"]) -> tuple[TreePose, Float[Tensor, "3 j b"]]:
         """The tree and the observed joint centres in the camera's frame, the batch innermost."""
         body, turn = self.body, self.camera.R_camera_world.to(x)
-        base = turn @ body.base_rotation
         origin = turn @ body.base_translation + self.camera.t_camera_world.to(x)
+        base = torch.cat([turn @ body.base_rotation, origin[:, None]], 1)
         q = x if body.is_untied else x @ body.tie.T + body.offset
-        frames = body.tree.frames(q, base, origin)
+        frames = body.tree.frames(q, base)
         points = body.tree.points(
             frames, body.marker_link[self.index], body.marker_offset[self.index]
         )
