@@ -220,7 +220,6 @@ def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
     assert tracker.dynamics.deviation == 0
     assert (tracker.forgetting, tracker.likelihood_power) == (1, 1)
     assert not tracker.keep_alike
-    assert not tracker.laplace_evidence
     assert (tracker.separation, tracker.oversampling) == (0.03, 1)
     assert PRESETS[name].optimiser == PRESETS["ijrr_css"].optimiser
 

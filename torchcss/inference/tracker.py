@@ -54,7 +54,7 @@ from torchcss.inference.trust_region import (
     check_bounds,
     default_prior_variance,
 )
-from torchcss.linalg import constrained_inverse, inverse_on_free, log_determinant
+from torchcss.linalg import constrained_inverse, inverse_on_free
 from torchcss.types import (
     Bounds,
     Items,
@@ -293,9 +293,6 @@ class Tracker(SequenceTracker):
         num_modes: Modes kept, `K`; the papers use 3 for an arm and 7 for a body.
         optimiser: How samples descend.
         dynamics: What happens between frames; the papers' driftless diffusion by default.
-        laplace_evidence: Weigh a mode by its Laplace evidence, likelihood times
-            `sqrt(det Sigma)`, instead of the likelihood at the mode alone (decision "mode
-            weights").
         forgetting: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence
             is forgotten by degrees.
         likelihood_power: Power of a frame's likelihood in the weights, step 3, and in the
@@ -336,7 +333,6 @@ class Tracker(SequenceTracker):
     proposal: Proposal
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
     dynamics: Dynamics = field(default_factory=Diffusion)
-    laplace_evidence: bool = False
     forgetting: float = 1.0
     likelihood_power: float = 1.0
     coarse_every: int = 3
@@ -524,10 +520,7 @@ class Tracker(SequenceTracker):
         if problem.weight_only is not None:
             cost = cost + problem.weight_only(modes.mean)
         told = torch.zeros_like(cost) if problem.past is None else problem.past.value(modes.mean)
-        volume = torch.zeros_like(cost)
-        if self.laplace_evidence:
-            volume = 0.5 * log_determinant(modes.covariance)
-        log_weight = volume - self.likelihood_power * cost
+        log_weight = -self.likelihood_power * cost
         unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
         remembered = self.forgetting * prior.mixture.normalise().log_weight
         tempered = prior.mixture._replace(log_weight=remembered)
@@ -536,7 +529,7 @@ class Tracker(SequenceTracker):
             past = prior_at(unpruned, tempered, self.surprise)
             # It takes the place of what the cost says of the past, which else would count twice.
             past = past._replace(log_weight=past.log_weight + self.likelihood_power * told)
-        kept = self._explanations(problem, unpruned, volume - cost, past)
+        kept = self._explanations(problem, unpruned, -cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
             past = match_to_prior(pruned, tempered)
