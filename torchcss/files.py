@@ -333,16 +333,21 @@ def shortened(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+_DEEPEST = 50
+"""Levels of a JSON file."""
+
+
 def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
     """Return the content of a JSON file.
 
     Raises:
-        error_class: If the file is missing, empty, unreadable or not JSON.
+        error_class: If the file is missing, empty, unreadable, not JSON, or nested so deeply that
+            readers would fail on it.
     """
     data = read_bytes(path, error_class)
     with refusing(error_class, f"{path}: not a JSON file"):
         try:
-            return json.loads(data)
+            content = json.loads(data)
         except ValueError:
             if path.suffix.lower() == ".json":
                 raise
@@ -350,6 +355,25 @@ def load_json(path: Path, error_class: type[TorchcssError]) -> Any:
                 f"{path}: not a JSON file, nor of another format that is read; docs/guide.md lists "
                 "them"
             ) from None
+    if not _is_shallow(content):
+        raise error_class(f"{path}: nested more than {_DEEPEST} levels deep, as no format is")
+    return content
+
+
+def _is_shallow(content: Any) -> bool:
+    """Whether nothing is nested more than `_DEEPEST` levels deep."""
+    level = [content]
+    for _ in range(_DEEPEST):
+        level = [
+            each
+            for within in level
+            if isinstance(within, (dict, list))
+            for each in (within.values() if isinstance(within, dict) else within)
+            if isinstance(each, (dict, list))
+        ]
+        if not level:
+            return True
+    return False
 
 
 def load_arrays(

@@ -198,6 +198,17 @@ def test_brackets_without_end(tmp_path: Path, suffix: str) -> None:
     refused(keypoints if suffix in (".json", ".csv") else load_camera, path)
 
 
+@pytest.mark.parametrize("depth", [60, 700])
+@pytest.mark.parametrize(("opened", "closed"), [("[", "]"), ('{"a":', "}")])
+@pytest.mark.parametrize("read", [keypoints, load_camera])
+def test_objects_within_objects(
+    tmp_path: Path, depth: int, opened: str, closed: str, read: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "deep.json"
+    path.write_text(depth * opened + "1" + depth * closed)
+    assert "levels deep" in refused(read, path)
+
+
 def test_frames_that_are_far_away(tmp_path: Path) -> None:
     person = [300.0, 200.0, 1.0] * 17
     path = tmp_path / "a.json"

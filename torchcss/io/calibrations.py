@@ -290,9 +290,9 @@ def _has_camera(values: object) -> bool:
     )
 
 
-def _cameras_in(values: object) -> dict[str, Mapping[str, Any]]:
-    """Cameras by name, whatever stands beside or above them."""
-    if not isinstance(values, Mapping):
+def _cameras_in(values: object, depth: int = 4) -> dict[str, Mapping[str, Any]]:
+    """Cameras by name, whatever stands beside them or, some levels deep, above."""
+    if not isinstance(values, Mapping) or not depth:
         return {}
     found = {str(name): each for name, each in values.items() if _has_camera(each)}
     for name, each in found.items():
@@ -300,7 +300,7 @@ def _cameras_in(values: object) -> dict[str, Mapping[str, Any]]:
             found[name] = {**each, "fisheye": True}
     for name, each in values.items():
         if str(name) not in found:
-            below = _cameras_in(each).items()
+            below = _cameras_in(each, depth - 1).items()
             found |= {f"{name}/{n}" if n in found else n: camera for n, camera in below}
     return found
 
