@@ -111,6 +111,28 @@ def test_weights_are_sums_over_all_paths(t: int, power: float):
     np.testing.assert_allclose(found.exp().numpy(), expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weights_in_any_type_and_with_padded_modes(dtype: torch.dtype):
+    t, k, n = 6, 3, 2
+    mean, spread, cost = (
+        part.to(dtype) for part in (draw(t, k, n), covariances(t, k, n=n), draw(t, k, seed=3))
+    )
+    times, transition = uneven_times(t), Transition(velocity=3.0)
+    alone = mode_weights(mean, spread, cost, times, transition, power=0.15)
+    assert alone.dtype == dtype
+    torch.testing.assert_close(alone.exp().sum(1), torch.ones(t, dtype=dtype))
+    padded = mode_weights(
+        torch.cat([mean, torch.zeros(t, 2, n, dtype=dtype)], 1),
+        torch.cat([spread, torch.zeros(t, 2, n, n, dtype=dtype)], 1),
+        torch.cat([cost, torch.full((t, 2), math.inf, dtype=dtype)], 1),
+        times,
+        transition,
+        power=0.15,
+    )
+    torch.testing.assert_close(padded[:, :k], alone)
+    assert bool((padded[:, k:] == -math.inf).all())
+
+
 def test_weights_forget_what_a_path_adds_up():
     # One mode is cheaper by a nat in every frame: the best path never leaves it, however small a
     # share of it is new; the weights do, as far as motions between the modes are possible.
