@@ -602,6 +602,43 @@ def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, end: byte
     np.testing.assert_allclose(body.part_rotation[part].abs()[:, 2], [1, 0, 0], atol=1e-12)
 
 
+COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="millimeter" meter="0.001"/><up_axis>Y_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="9">-5 -3 0 5 3 0 0 0 40</float_array></source>
+<source id="n"><float_array id="na" count="3">0 0 9e9</float_array></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+</mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s">
+<node><translate>200 0 0</translate><node><rotate>0 2 0 90</rotate><scale>10 10 10</scale>
+<instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes></COLLADA>"""
+
+
+def with_a_mesh(path: Path, name: str, content: str) -> Path:
+    planar_arm(path, 0.5, 0.4)
+    (path.parent / name).write_text(content)
+    mesh = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+    text = path.read_text().replace('<link name="link2"/>', f'<link name="link2">{mesh}</link>')
+    path.write_text(text)
+    return path
+
+
+def test_collada_says_its_unit_and_where_a_mesh_stands(tmp_path: Path) -> None:
+    body = load_body(with_a_mesh(tmp_path / "arm.urdf", "a.dae", COLLADA))
+    part = body.part_names.index("link2")
+    np.testing.assert_allclose(body.part_shape[part, :3], [0.03, 0.05, 0.2], atol=1e-12)
+    np.testing.assert_allclose(body.part_translation[part], [0.4, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(body.part_rotation[part].abs()[:, 2], [1, 0, 0], atol=1e-12)
+    for spoilt in ("40<", "#g", "</node>", "200 0 0", "0.001"):
+        (tmp_path / "a.dae").write_text(COLLADA.replace(spoilt, "x"))
+        assert any("a.dae: not COLLADA" in note for note in load_body(tmp_path / "arm.urdf").notes)
+
+
+def test_a_link_of_many_metres_is_told(tmp_path: Path) -> None:
+    path = with_a_mesh(tmp_path / "arm.urdf", "a.obj", "v 0 0 0\nv 50 90 400\n")
+    note = "link 'link2' is 400 m large by its mesh, more than links are: if that is in millimetres"
+    assert any(note in each for each in load_body(path).notes)
+
+
 def test_meshes_that_stand_for_a_link_are_told(tmp_path: Path) -> None:
     path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
     mesh = '<visual><geometry><mesh filename="package://arm/meshes/a.dae"/></geometry></visual>'

@@ -4,8 +4,8 @@ The parser of pytorch-kinematics leaves limits and mimic joints out, and keeps s
 origins and axes: the file is read here. A floating joint of the root link is a free root, and what
 hangs on that link beside it is left out. Solids are boxes, cylinders, spheres and capsules: the
 visual ones of a link, or where it has none those for collisions. A link that has only meshes is as
-large as the box around them, in its own frame, if they are STL files in the folder of the URDF or
-below it; others are not opened.
+large as the box around them, in its own frame, if they are STL, OBJ or COLLADA files in the folder
+of the URDF or below it; others are not opened.
 
 Call `read_urdf`; `torchcss.load_body("x.urdf")` does.
 """
@@ -48,6 +48,9 @@ PointsOf = Callable[[Path], Float[np.ndarray, "8 3"]]
 
 _THINNEST = 0.001
 """Half the thickness of the thinnest part, metres."""
+
+_LARGEST = 10.0
+"""A link's half side that is none: such as of a mesh in millimetres, metres."""
 
 _ROUNDED = (0.5, 1.0, 0.0, 0.0, 0.0, 0.0)
 """What a part in a box has beside its half sides: a section that is round, ends that are nearly
@@ -260,6 +263,11 @@ def _boxes_of_meshes(
             continue
         low, high = corners.min(0), corners.max(0)
         half = np.maximum(0.5 * (high - low), _THINNEST)
+        if (largest := half.max()) > _LARGEST:
+            notes.append(
+                f"link {name!r} is {2 * largest:.0f} m large by its mesh, more than links are: if "
+                'that is in millimetres, say <mesh scale="0.001 0.001 0.001">'
+            )
         order = np.argsort(half)  # a superquadric's own axis is its longest
         turn = np.eye(3)[:, order]
         turn[:, 0] *= np.linalg.det(turn)
@@ -276,7 +284,9 @@ def _boxes_of_meshes(
         names = shortened(", ".join(part.name for part in parts))
         notes.append(f"as large as the boxes around their meshes: {names}")
     if unopened:
-        notes.append(unopened_meshes(unopened, "<collision>, or STL or OBJ files in this folder,"))
+        notes.append(
+            unopened_meshes(unopened, "<collision>, or files .stl, .obj or .dae in this folder,")
+        )
     return tuple(parts)
 
 
