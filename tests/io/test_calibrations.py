@@ -396,7 +396,7 @@ def test_sizes_by_any_usual_name(tmp_path: Path, size: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "model",
     [{"model": "fisheye"}, {"camera_model": "OPENCV_FISHEYE"}, {"distortion_type": "KannalaBrandt"},
-     {"camera_model": "omni", "distortion_model": "radtan"}],
+     {"camera_model": "omni", "distortion_model": "radtan"}, {"fisheye_model": 1}],
 )  # fmt: skip
 def test_fisheye_by_any_usual_name(tmp_path: Path, model: dict[str, Any]) -> None:
     content = {"K": K, "D": LENS[:4], "width": 640, "height": 480, **model}
@@ -501,7 +501,8 @@ def test_numbers_as_text(tmp_path: Path, text: str, name: str | None) -> None:
     path.write_text(text)
     entry = read_entries(path)[name or "calib"]
     np.testing.assert_allclose(np.reshape(entry.K, (3, 3)), K, atol=1e-6)
-    assert entry.rotation is None
+    assert (entry.rotation is None) == ("K_" in text or "camera matrix" in text)  # else P says it
+    assert entry.rotation is None or entry.units is None
     assert entry.image_size_wh == ([640, 480] if "width" in text else None)
 
 
@@ -522,3 +523,113 @@ def test_cameras_wherever_they_stand(tmp_path: Path, form: str) -> None:
             load_camera(path)
     else:
         check(path, [0.0] * 5)
+
+
+POSE = np.linalg.solve(np.array(K), PROJECTION)
+
+
+@pytest.mark.parametrize("form", ["npz", "stack", "npy", "json", "numbered", "txt", "folder", "K"])
+def test_matrices_of_several_cameras(tmp_path: Path, form: str) -> None:
+    stack, name = np.stack([PROJECTION, -3 * PROJECTION]), "1"
+    path = tmp_path / "a.npz"
+    if form == "npz":
+        np.savez(path, left=stack[0], right=stack[1], image_size=np.array(SIZE))
+        name = "right"
+    elif form == "stack":
+        np.savez(path, P=stack, units="m", image_size=np.array(SIZE))
+    elif form == "npy":
+        path = tmp_path / "a.npy"
+        np.save(path, stack)
+    elif form == "json":
+        path, name = tmp_path / "a.json", "cam1"
+        path.write_text(json.dumps({"cam0": stack[0].tolist(), "cam1": stack[1].tolist()}))
+    elif form == "numbered":
+        np.savez(path, P0=stack[0], P1=stack[1])
+    elif form == "K":
+        R, t = np.stack(2 * [POSE[:, :3]]), np.stack(2 * [POSE[:, 3]])
+        np.savez(path, K=np.array([K, K]), dist=np.array([LENS, LENS]), R=R, t=t, units="m",
+                 names=np.array(["a", "b"]), image_size=np.array(SIZE))  # fmt: skip
+        name = "b"
+    else:
+        path, name = tmp_path / "all", "view1"
+        path.mkdir()
+        for index, matrix in enumerate(stack):
+            if form == "txt":
+                (path / f"view{index}.txt").write_text(rows(matrix))
+            else:
+                np.savez(path / f"view{index}.npz", proj=matrix)
+    assert len(read_entries(path)) == 2
+    entry = read_entries(path)[name]
+    np.testing.assert_allclose(entry.K, K, atol=1e-9)
+    np.testing.assert_allclose(entry.rotation, POSE[:, :3], atol=1e-12)
+    np.testing.assert_allclose(entry.translation, POSE[:, 3], atol=1e-12)
+    assert entry.units == ("m" if form in ("stack", "K") else None)
+    assert entry.image_size_wh == (list(SIZE) if form in ("npz", "stack", "K") else None)
+    if form in ("stack", "K"):
+        assert load_camera(path, name).metric
+
+
+def test_a_folder_of_a_file_for_each_camera(tmp_path: Path) -> None:
+    for name in ("left", "right"):
+        text = FILES["ROS"][1].replace("camera_name: left", "camera_name: narrow_stereo")
+        (tmp_path / f"{name}.yaml").write_text(text)
+    assert list(read_entries(tmp_path)) == ["narrow_stereo", "right/narrow_stereo"]
+
+
+@pytest.mark.parametrize("form", ["words", "Human3.6M", "VideoPose3D", "order", "by name"])
+def test_coefficients_in_other_orders(tmp_path: Path, form: str) -> None:
+    k1, k2, p1, p2, k3 = LENS
+    parts = {"radial_distortion": [k1, k2, k3], "tangential_distortion": [p1, p2]}
+    size = {"width": 640, "height": 480}
+    content: dict[str, Any] = {
+        "words": {"camera_matrix": K, **parts, **size},
+        "Human3.6M": {"f": [FX, FY], "c": [CX, CY], "k": [k1, k2, k3], "p": [p1, p2], **size},
+        "VideoPose3D": {"focal_length": [FX, FY], "center": [CX, CY], **parts, "res_w": 640,
+                        "res_h": 480},
+        "order": {"K": K, "distortion_order": ["k1", "k2", "k3", "p1", "p2"],
+                  "distortion": [k1, k2, k3, p1, p2], **size},
+        "by name": {"K": K, "dist": {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}, **size},
+    }[form]  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    check(tmp_path / "a.json")
+
+
+def test_metashape_counts_from_the_middle(tmp_path: Path) -> None:
+    k1, k2, p1, p2, k3 = LENS
+    path = tmp_path / "a.xml"
+    values = {"projection": "frame", "width": 640, "height": 480, "f": FY, "cx": CX - 319.5,
+              "cy": CY - 239.5, "b1": FX - FY, "k1": k1, "k2": k2, "k3": k3, "p1": p2, "p2": p1,
+              "date": "2024-05-03T10:15:30Z"}  # fmt: skip
+    inner = "".join(f"<{word}>{value}</{word}>" for word, value in values.items())
+    path.write_text(f"<calibration>{inner}</calibration>")
+    check(path)
+    path.write_text(f"<calibration>{inner.replace('frame', 'fisheye')}</calibration>")
+    with pytest.raises(CameraError, match="fisheye"):
+        load_camera(path)
+
+
+def test_what_a_camera_file_leaves_open_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_text(table("cam_0", [0.0, 0.0, 2.0], "rotation_count = 2"))
+    assert "rotation_count 2), its numbers are those of the pictures as recorded" in str(
+        load_camera(path).units_note
+    )
+    path = tmp_path / "a.npz"
+    np.savez(path, K=K, D=np.array([[0.02], [-0.01], [0.003], [-0.0004]]), size=np.array(SIZE))
+    note = str(load_camera(path).units_note)
+    assert "no extrinsics" in note
+    assert "as cv2.fisheye writes them" in note
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("results-cam.txt", "Camera-system parameters:\ncam0 (/a):\n", "give the camchain.yaml"),
+        ("a.qca.txt", "<calibration/>", "motion capture system; save it as Pose2Sim's"),
+        ("a.pickle", "x", "a pickle, from which code may run"),
+    ],
+)
+def test_calibrations_of_other_kinds(tmp_path: Path, name: str, text: str, words: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CameraError, match=words):
+        load_camera(tmp_path / name)

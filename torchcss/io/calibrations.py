@@ -7,16 +7,17 @@
 | Pose2Sim, Anipose, FreeMoCap, Caliscope | `.toml`: a table for each camera |
 | EasyMocap | `intri.yml` with `names`, beside it `extri.yml` |
 | OpenCV, ROS | YAML, JSON or XML with `camera_matrix`; `M1`, `D1`, `M2`, `D2` of a pair |
-| OpenPose | XML with `Intrinsics`, a file or a folder of them |
+| OpenPose, Metashape | XML with `Intrinsics`, or with `f`, `cx`, `cy` from the middle |
 | Kalibr | YAML: `cam0` with `intrinsics` |
 | COLMAP | `cameras.txt` or `cameras.bin`, or their folder |
 | KITTI, ROS | `.txt`: numbers below or behind what they are |
 | MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
-| arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone |
+| arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone; of several cameras |
 
 Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
 the corner of the image, MATLAB's from 1; both are brought to pixel centres at integers. A 3 x 4
-matrix P that projects points of the world is taken apart; matrices by columns are turned.
+matrix P that projects points of the world is taken apart; matrices by columns are turned. A folder
+may hold a file for every camera.
 
 Call `read_entries`.
 """
@@ -43,7 +44,6 @@ from torchcss.files import (
     load_arrays,
     load_json,
     naming,
-    one_line,
     read_bytes,
     read_text,
     real_numbers,
@@ -51,6 +51,7 @@ from torchcss.files import (
     shortened,
     unexpected,
 )
+from torchcss.io.keypoints.json_people import listed
 from torchcss.io.keypoints.words import SIDES, SIZES, first_of, plain_word
 from torchcss.joint_names import names_in
 
@@ -94,6 +95,10 @@ _WORDS = {
     ),
     "rotation": names_in("r rotation rot rvec rotationmatrix rotationvector"),
     "translation": names_in("t translation tvec translationvector"),
+    "focal": names_in("focallength focal fc f"),
+    "centre": names_in("principalpoint center centre cc c"),
+    "radial": names_in("radialdistortion radial rdistort k"),
+    "tangential": names_in("tangentialdistortion tangential tdistort p"),
 }  # fmt: skip
 """What a camera's numbers are called (`torchcss.io.keypoints.words`), the first that is there."""
 
@@ -108,16 +113,18 @@ _ONE_BY_ONE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "f
 """What the numbers of K are called where each has a name; the last are Nerfstudio's."""
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_NAMED = {*_COEFFICIENTS}
 
 _SHAPES = ("img_shape", "image_shape", "ImageSize", "shape")
 """What height and width are called where they are given in this order; the third is MATLAB's."""
 
-_SIDES = (*SIDES, ("w", "h"), ("imgw", "imgh"), ("cols", "rows"))
+_SIDES = (*SIDES, ("w", "h"), ("imgw", "imgh"), ("resw", "resh"), ("cols", "rows"), ("nx", "ny"))
 _NAMES = names_in("name cameraname cameraid camid id serial serialnumber")
 _MODELS = names_in(
     "distortionmodel cameramodel model cameratype distortiontype lensmodel lens lenstype "
     "projection type"
 )
+_IS_FISHEYE = names_in("fisheye isfisheye usefisheye fisheyemodel")
 _FISHEYE = re.compile("equidist|fish_?eye|kannala|omni|eucm|fov|^ds$|^ds-|-ds$", re.IGNORECASE)
 
 _ROUNDING = 1e-3
@@ -130,6 +137,13 @@ _MOST_BYTES = 2**26
 
 _DEEPEST = 50
 """Brackets in brackets of a calibration in YAML."""
+
+_OTHERS = {
+    ".pickle .pkl": "a pickle, from which code may run: not read; save K, dist, R and t with "
+    "numpy.savez",
+    ".qca.txt .xcp": "the calibration of a motion capture system; save it as Pose2Sim's Calib.toml",
+}
+"""Files of other kinds by how their names end, and what to do."""
 
 _COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1",
@@ -155,16 +169,33 @@ def read_entries(path: Path) -> dict[str, Entry]:
         MissingExtraError: If SciPy is needed and not installed.
     """
     if path.is_dir():
-        places = [path / n for n in (INTRINSICS, *_OF_COLMAP)]
-        places += [path / inner / n for inner in ("sparse/0", "0", "sparse") for n in _OF_COLMAP]
-        inner = next((place for place in places if place.is_file()), None)
-        files = sorted(path.glob("*.xml")) if inner is None else [inner]
-        if not files:
-            names = ", ".join((INTRINSICS, *_OF_COLMAP))
-            raise CameraError(f"{path}: no calibration in this folder; expected {names} or .xml")
-        return {name: entry for file in files for name, entry in read_entries(file).items()}
+        return _read_folder(path)
+    for suffixes, what in _OTHERS.items():
+        if path.name.lower().endswith(tuple(suffixes.split())) and path.is_file():
+            raise CameraError(f"{path}: {what}")
     with naming(path, CameraError):
         return _READERS.get(path.suffix.lower(), _read_json)(path)
+
+
+def _read_folder(path: Path) -> dict[str, Entry]:
+    """The cameras of a program's folder, or of a file for each of them."""
+    places = [path / n for n in (INTRINSICS, *_OF_COLMAP)]
+    places += [path / inner / n for inner in ("sparse/0", "0", "sparse") for n in _OF_COLMAP]
+    files = [place for place in places if place.is_file()][:1]
+    kinds = iter((".xml", ".toml", ".yaml", ".yml", ".json", ".npz", ".npy", ".txt"))
+    while not files and (suffix := next(kinds, None)) is not None:
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() == suffix]
+    if not files:
+        names = ", ".join((INTRINSICS, *_OF_COLMAP))
+        raise CameraError(
+            f"{path}: no calibration in this folder; expected {names} or a file for every camera"
+        )
+    found: dict[str, Entry] = {}
+    for file in files:
+        for name, entry in read_entries(file).items():
+            # Some programs call every camera the same.
+            found[name if name not in found else f"{file.stem}/{name}"] = entry
+    return found
 
 
 # The same things in other words.
@@ -177,31 +208,87 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         if isinstance(inner, Mapping) and "data" not in inner:  # a mapping of its own
             rest = {key: each for key, each in values.items() if plain_word(key) not in words}
             values = {**rest, **inner}
-    found = {key: _plain(first_of(values, words)) for key, words in _WORDS.items()}
+    found = {n: _plain(first_of(values, _WORDS[n])) for n in ("K", "rotation", "translation")}
     if found["rotation"] is None and (pose := _square(first_of(values, _POSES), 4)) is not None:
         found |= {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
     if (K := _square(found["K"], 3)) is not None:
         found["K"] = K.tolist()
-    projection = first_of(values, _PROJECTIONS) if found["K"] is None else found["K"]
-    if (projection := _square(projection, 4)) is not None:
-        parts = _parts_of(projection[:3])
+    elif (numbers := _focal_and_centre(values)) is not None:
+        found["K"] = numbers
+    if (projection := _projection(values)) is not None:
+        parts = _parts_of(projection)
         # Of K with a column of zeros the place is not known.
-        found |= parts if projection[:3, 3].any() else {"K": parts["K"]}
-    named = {key: value for key, value in values.items() if plain_word(key) not in _MODELS}
-    lenses = [_plain(named[key]) for key in named if _DISTORTION.match(plain_word(key))]
-    lens = next((each for each in lenses if each is not None), None)
-    if isinstance(lens, Mapping):
-        values, lens = {**values, **lens}, None
+        found |= parts if projection[:, 3].any() else {"K": parts["K"]}
     for names in _ONE_BY_ONE:
         if found["K"] is None and None not in (numbers := [values.get(each) for each in names]):
             found["K"] = numbers if names[0] == "fx" else _from_corner(numbers)
-    if lens is None and any(each in values for each in _COEFFICIENTS):
-        lens = [values.get(each, 0.0) for each in _COEFFICIENTS]
     models = [str(first_of(values, (word,))) for word in _MODELS]
-    fisheye = values.get("fisheye", False) or any(map(_FISHEYE.search, models))
-    size, video = _said_size(values), values.get("video")
+    said = str(first_of(values, _IS_FISHEYE)).lower() not in ("none", "false", "0")
+    lens, size, video = _lens(values), _said_size(values), values.get("video")
+    notes = []
+    if turned := first_of(values, ("rotationcount",)):  # Caliscope's
+        notes.append(
+            f"its pictures are shown turned (rotation_count {shortened(turned)}), its numbers are "
+            "those of the pictures as recorded: track them as recorded"
+        )
+    if _shape(lens) == (4, 1):
+        notes.append(
+            "its four coefficients stand in a column, as cv2.fisheye writes them, and are taken as "
+            "k1 k2 p1 p2: of a fisheye lens undistort the video first"
+        )
     return Entry(**found, image_size_wh=size, distortion=lens, units=units, video=video,
-                 fisheye=fisheye, name=values.get("name"))  # fmt: skip
+                 fisheye=said or any(map(_FISHEYE.search, models)), name=values.get("name"),
+                 note="; ".join(notes) or None)  # fmt: skip
+
+
+def _projection(values: Mapping[str, Any]) -> np.ndarray | None:
+    """The 3 x 4 matrix that projects points of the world; None: there is none, or K beside it."""
+    given = first_of(values, _WORDS["K"])
+    matrix = _square(first_of(values, _PROJECTIONS) if given is None else given, 4)
+    return None if matrix is None else matrix[:3]
+
+
+def _focal_and_centre(values: Mapping[str, Any]) -> list[Any] | None:
+    """fx, fy, cx, cy where focal lengths and principal point stand side by side."""
+    focal, centre = (_plain(first_of(values, _WORDS[word])) for word in ("focal", "centre"))
+    if isinstance(focal, (int, float)):
+        focal = [focal, focal]
+    given = isinstance(focal, list) and isinstance(centre, list)
+    return [*focal, *centre] if given and len(focal) == len(centre) == 2 else None
+
+
+def _lens(values: Mapping[str, Any]) -> Any:
+    """The coefficients of the lens in OpenCV's order, or whatever stands in their place."""
+    lenses = [
+        _plain(each)
+        for word, each in values.items()
+        if each is not None
+        and _DISTORTION.match(plain_word(word))
+        and plain_word(word) not in _MODELS
+    ]
+    names = [each for each in lenses if isinstance(each, list) and {*map(str, each)} <= _NAMED]
+    lens = next((each for each in lenses if each not in names), None)
+    if names and isinstance(lens, list) and len(names[0]) == len(lens):
+        lens = dict(zip(names[0], lens, strict=True))
+    if isinstance(lens, Mapping):
+        values, lens = {**values, **lens}, None
+    if lens is not None:
+        return lens
+    if any(each in values for each in _COEFFICIENTS):
+        return [values.get(each, 0.0) for each in _COEFFICIENTS]
+    radial, tangential = (first_of(values, _WORDS[word]) for word in ("radial", "tangential"))
+    if len(shape := _shape(radial)) != 1 or not 0 < shape[0] <= 6 or radial is None:
+        return None
+    k1, k2, *more = [*radial, 0.0, 0.0]
+    p1, p2 = tangential if isinstance(tangential, list) and len(tangential) == 2 else (0.0, 0.0)
+    return [k1, k2, p1, p2, *more]
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    """The shape of nested lists; none of what is no array."""
+    with suppress(ValueError):
+        return np.shape(value)
+    return ()
 
 
 def _square(value: Any, size: int) -> np.ndarray | None:
@@ -285,9 +372,31 @@ def _has_camera(values: object) -> bool:
         return _has_camera(K)
     return (
         K is not None
-        or _square(first_of(values, _PROJECTIONS), 4) is not None
+        or _projection(values) is not None
+        or _focal_and_centre(values) is not None
         or any(set(names) <= values.keys() for names in _ONE_BY_ONE)
     )
+
+
+def _arrays_of(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Cameras that are 3 x 4 matrices by name, or whose numbers are arrays of all cameras."""
+    K = first_of(values, (*_WORDS["K"], *_PROJECTIONS))
+    if len(shape := _shape(K)) == 3:
+        count = range(shape[0])
+        names = listed(first_of(values, names_in("names cameranames cameras ids")))
+        each = [
+            {
+                word: value[i] if len(_shape(value)) > 1 and len(value) == shape[0] else value
+                for word, value in values.items()
+            }
+            for i in count
+        ]
+        return dict(zip(map(str, names if len(names) == shape[0] else count), each, strict=True))
+    if K is not None or _numbered(values):
+        return {}
+    matrices = {name: each for name, each in values.items() if _shape(each) == (3, 4)}
+    rest = {name: each for name, each in values.items() if name not in matrices}
+    return {name: {**rest, "P": each} for name, each in matrices.items()}
 
 
 def _cameras_in(values: object, depth: int = 4) -> dict[str, Mapping[str, Any]]:
@@ -324,9 +433,13 @@ def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
     cameras: Mapping[str, Mapping[str, Any]] = _numbered(values)
     if not cameras and not _has_camera(values):
         raise unexpected(CameraError, path, "a calibration with camera_matrix", list(values))
-    name = str(values.get("camera_name", values.get("name", path.stem)))
-    entries = {name: _entry(own) for name, own in (cameras or {name: values}).items()}
-    return {n: entry._replace(rotation=None, translation=None) for n, entry in entries.items()}
+    alone = str(values.get("camera_name", values.get("name", path.stem)))
+    entries: dict[str, Entry] = {}
+    for name, own in (cameras or {alone: values}).items():
+        entry = _entry(own, values.get("units"))
+        place = entry[3:5] if _projection(own) is not None else (None, None)
+        entries[name] = entry._replace(rotation=place[0], translation=place[1])
+    return entries
 
 
 # Formats.
@@ -341,9 +454,9 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
     """The only camera of a file, or cameras by name or in a list; their unit if none is said."""
     if not isinstance(content, dict):
         raise unexpected(CameraError, path, "an object 'cameras' with one under each name", content)
-    if "RadialDistortion" in content and _is_matlabs(content):
-        return {path.stem: _matlab_entry(path, content)}
-    cameras = content.get("cameras")
+    if "RadialDistortion" in content and _has_camera(content):
+        return {path.stem: _matlab_entry(content)}
+    cameras = _arrays_of(content) or content.get("cameras")
     if cameras is None and (_has_camera(content) or _numbered(content)):
         return _alone(path, content)
     if isinstance(cameras, list) and all(isinstance(each, dict) for each in cameras):
@@ -402,9 +515,12 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
 
 def _read_text(path: Path) -> dict[str, Entry]:
     """COLMAP's cameras, a matrix alone, or numbers below or behind what they are (ROS, KITTI)."""
+    text = read_text(path, CameraError)
+    if "Camera-system parameters" in text:
+        raise CameraError(f"{path}: Kalibr's report; give the camchain.yaml beside it")
     lines = {
         f"{path}: line {number}": line.strip(" \t,;[]")
-        for number, line in enumerate(read_text(path, CameraError).splitlines(), start=1)
+        for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     }
     found: dict[str, list[float]] = {}
@@ -524,16 +640,15 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     for each in [each for each in values.values() if isinstance(each, dict)]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
         if all(map(_has_camera, pair.values())):
-            return {n: _matlab_entry(path, each) for n, each in pair.items() if each is not None}
-        values = each if _is_matlabs(each) else values
+            return {n: _matlab_entry(each) for n, each in pair.items() if each is not None}
+        values = each if _has_camera(each) else values
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
-        K, size = [*values["fc"], *values["cc"]], _size(values.get("nx"), values.get("ny"))
-        return {path.stem: Entry(K, size, values.get("kc"))}
-    if not _is_matlabs(values):
+        return _alone(path, values)
+    if not _has_camera(values):
         raise unexpected(
             CameraError, f"{path}", "toStruct(cameraParams) or Bouguet's fc and cc", list(values)
         )
-    return {path.stem: _matlab_entry(path, values)}
+    return {path.stem: _matlab_entry(values)}
 
 
 def _check_matlab_size(path: Path) -> None:
@@ -551,26 +666,12 @@ def _check_matlab_size(path: Path) -> None:
             raise CameraError(f"{path}: more than {_MOST_BYTES:,} bytes; not a calibration")
 
 
-def _is_matlabs(values: Mapping[str, Any]) -> bool:
-    """Whether these are cameraParameters or cameraIntrinsics."""
-    return _has_camera(values) or {"FocalLength", "PrincipalPoint"} <= values.keys()
-
-
-def _matlab_entry(path: Path, values: Mapping[str, Any]) -> Entry:
+def _matlab_entry(values: Mapping[str, Any]) -> Entry:
     found = _entry(values)
-    try:
-        if found.K is None:
-            (fx, fy), (cx, cy) = values["FocalLength"], values["PrincipalPoint"]
-            found = found._replace(K=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        K = np.array(found.K, float)
-        K[:2, 2] -= 1
-        radial = np.ravel(values.get("RadialDistortion", values.get("RDistort", [0, 0])))
-        tangential = np.ravel(values.get("TangentialDistortion", values.get("TDistort", [0, 0])))
-        k1, k2, k3 = [*radial.tolist(), 0.0, 0.0, 0.0][:3]
-        p1, p2 = [*tangential.tolist(), 0.0, 0.0][:2]
-    except (ValueError, TypeError, IndexError, KeyError) as error:
-        raise CameraError(f"{path}: expected cameraParams, found {one_line(error)}") from error
-    return Entry(K.tolist(), found.image_size_wh, [k1, k2, p1, p2, k3])
+    with refusing(CameraError, "expected cameraParams"):
+        K = real_numbers(found.K, "K", CameraError)
+        K = K - (0, 0, 1, 1) if K.shape == (4,) else K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
+    return found._replace(K=K.tolist(), rotation=None, translation=None)
 
 
 def _listed(value: Any) -> Any:
@@ -596,15 +697,25 @@ def _read_xml(path: Path) -> dict[str, Entry]:
                 found[element.tag] = json.loads((element.text or "").strip() or "null")
         except (ValueError, IndexError):
             found[element.tag] = (element.text or "").strip()
-    return _alone(path, found)
+    return _alone(path, _from_the_middle(found) if root.tag == "calibration" else found)
+
+
+def _from_the_middle(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Metashape's numbers in OpenCV's words: it has p2 before p1, and a middle where we have 0."""
+    words = names_in("f cx cy b1 b2 k1 k2 k3 k4 p1 p2 width height")
+    f, cx, cy, b1, b2, k1, k2, k3, k4, p2, p1, width, height = (found.get(w) or 0 for w in words)
+    with refusing(CameraError, "not Metashape's calibration"):
+        K = [[f + b1, b2, cx + 0.5 * (width - 1)], [0, f, cy + 0.5 * (height - 1)], [0, 0, 1]]
+    return {"K": K, "dist": [k1, k2, p1, p2, k3, k4], "image_size_wh": [width, height],
+            "projection": found.get("projection")}  # fmt: skip
 
 
 def _read_arrays(path: Path) -> dict[str, Entry]:
-    """Arrays by the usual words, or K alone."""
+    """Arrays by the usual words, or K or P alone."""
     if path.suffix.lower() == ".npy":
-        return _alone(path, {"K": load_array(path, CameraError).tolist()})
+        return _read_content(path, {"K": load_array(path, CameraError).tolist()})
     arrays = load_arrays(path, CameraError, _MOST_BYTES)
-    return _alone(path, {name: array.tolist() for name, array in arrays.items()})
+    return _read_content(path, {name: array.tolist() for name, array in arrays.items()})
 
 
 # YAML.

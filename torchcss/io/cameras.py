@@ -115,7 +115,8 @@ def load_camera(
         camera = camera.in_own_frame()
     elif unit is not None and unit != 1.0:
         camera = camera.in_world_times(unit)
-    return LoadedCamera(camera, note is None, note or entry.note)
+    said = "; ".join(each for each in (note, entry.note) if each)
+    return LoadedCamera(camera, note is None, said or None)
 
 
 def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
