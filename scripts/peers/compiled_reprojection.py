@@ -44,7 +44,6 @@ class CompiledReprojection(BlendedCost):
         if potential is None:
             raise ConfigurationError(f"{type(cost.potential).__name__} has no compiled twin")
         row, place = carried_markers(body, cost.index)
-        sharpness = 1 / array(body.sticky_deviation)
         seen = Reprojection(
             row=row,
             place=place,
@@ -54,8 +53,8 @@ class CompiledReprojection(BlendedCost):
             near=float(camera.near),
             potential=potential,
             mean=array(body.sticky_mean),
-            sharpness=0 * sharpness if cost.stabiliser is None else sharpness,
-            nu=1.0 if cost.stabiliser is None else float(cost.stabiliser.nu),
+            sharpness=1 / array(body.sticky_deviation),
+            nu=cost.nu,
         )
         return CompiledReprojection(pack_tree(body, camera), seen)
 

@@ -49,7 +49,7 @@ class JaxLevenbergMarquardt:
     """Descends on one `ReprojectionCost` from many starts.
 
     Args:
-        cost: The problem; its stabiliser must not be None.
+        cost: The problem.
         max_steps: Iterations per item.
         tolerance: Predicted decrease, nats, below which an item is done.
         compacted: Whether finished items are dropped.
@@ -142,8 +142,6 @@ def _padded(array: np.ndarray) -> np.ndarray:
 def _make_residuals(cost: ReprojectionCost):
     """A function of one state that returns residuals and their Jacobian."""
     body, camera = cost.body, cost.camera
-    assert cost.stabiliser is not None
-    stabiliser_nu = cost.stabiliser.nu
     names = body.tree.joint_names
     turn = camera.R_camera_world.numpy()
     base = turn @ body.base_rotation.numpy()
@@ -198,7 +196,7 @@ def _make_residuals(cost: ReprojectionCost):
         slope = (moved[..., :2] - ab[:, None] * moved[..., 2:]) * (inverse[:, None] * focal)
         error, slope = _robust(error, slope)
         z = (x - mean) / deviation
-        rho, first = _long_tailed(z * z, stabiliser_nu)
+        rho, first = _long_tailed(z * z, cost.nu)
         prior, prior_slope = _square_root(z, rho, first)
         residual = jnp.concatenate([error.ravel(), prior])
         jacobian = jnp.concatenate(

@@ -21,7 +21,7 @@ INSIDE = 1e-9
 
 
 class NumpyProblem:
-    """Residuals and derivatives of one `ReprojectionCost`; its stabiliser must not be None.
+    """Residuals and derivatives of one `ReprojectionCost`.
 
     Attributes:
         lower: Least admissible state.
@@ -30,7 +30,6 @@ class NumpyProblem:
 
     def __init__(self, cost: ReprojectionCost) -> None:
         body, camera = cost.body, cost.camera
-        assert cost.stabiliser is not None
         assert body.is_untied
         turn = camera.R_camera_world.numpy()
         base = np.eye(4)
@@ -65,7 +64,7 @@ class NumpyProblem:
         self.focal = camera.K.diagonal()[:2].numpy() / cost.pixel_noise
         self.shift = (camera.K[:2, 2] - cost.target).numpy() / cost.pixel_noise
         self.far = np.array(camera.image_size_wh) / cost.pixel_noise
-        self.mean, self.nu = body.sticky_mean.numpy(), cost.stabiliser.nu
+        self.mean, self.nu = body.sticky_mean.numpy(), cost.nu
         self.inverse = 1 / body.sticky_deviation.numpy()
         self.lower, self.upper = (bound.numpy() for bound in body.bounds)
         self._posed_at = b""

@@ -29,7 +29,7 @@ Attributes:
     near: Least depth that can be seen, metres.
     potential: `rho`.
     mean: Where the priors pull to.
-    sharpness: Reciprocals of their deviations; zero: there is no prior.
+    sharpness: Reciprocals of their deviations.
     nu: Height of their tails, nats.
 """
 

@@ -86,14 +86,14 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
     """Frame after frame: other keypoints, other modes, other draws, in the type of a tensor."""
     generator = torch.Generator().manual_seed(seed)
     problem = reprojection_problem(body_name, generator=generator)
-    body, camera = problem.body.to(like), problem.camera.to(like)
+    cost = problem.cost
+    body, camera, seen = cost.body.to(like), cost.camera.to(like), cost.target
     factor = torch.linalg.cholesky(problem.start.covariance).to(like)
     factor = factor.expand(pool, -1, -1).contiguous()
     choice = CostChoice().without("contour").having(JointTerm())
     motion = FRAME_INTERVAL * body.motion_rate
     while True:
-        uv = problem.observed + torch.randn(problem.observed.shape, generator=generator)
-        uv = uv.to(like)
+        uv = (seen + torch.randn(seen.shape, generator=generator)).to(like)
         observation = Keypoints(uv, torch.ones_like(uv[:, 0]), problem.joint_names)
         modes = torch.randn(NUM_MODES, len(motion), generator=generator).to(like)
         modes = problem.start.mean.to(like) + 0.5 * motion * modes

@@ -51,7 +51,7 @@ def test_options_change_what_they_say(problem):
     far = problem.truth[None] + 0.5
     assert float(other(robust=True).cost.value(far)) < 0.2 * float(problem.cost.value(far))
     given = other(pose={"r_elbow_flexion": 1.0})
-    assert float(given.truth[given.body.state_index("r_elbow_flexion")]) == 1.0
+    assert float(given.truth[given.cost.body.state_index("r_elbow_flexion")]) == 1.0
     assert float(given.cost.value(given.truth[None])) < 50
     with pytest.raises(BodyError, match="no parameter 'elbow'; it has"):
         other(pose={"elbow": 1.0})
@@ -86,7 +86,7 @@ def test_minima_that_two_runs_share(problem, run):
 def test_flips_are_named(problem):
     """The forearm leans the other way once its angle is reflected about the image plane."""
     assert depth_flips(problem, problem.start.mean[None]) == {}
-    body, axis = problem.cost.body, problem.camera.R_camera_world[2]
+    body, axis = problem.cost.body, problem.cost.camera.R_camera_world[2]
     elbow = body.state_index("r_elbow_flexion")
     ends = body.joint_index("r_wrist"), body.joint_index("r_elbow")
     x = problem.start.mean.repeat(100, 1)

@@ -83,7 +83,7 @@ class ReprojectionCost(BlendedCost):
         target: Where, pixels.
         pixel_noise: Standard deviation of each coordinate, pixels.
         potential: `rho` of the squared error in units of the noise.
-        stabiliser: The sticky prior, or None.
+        nu: Height of the tails of the sticky priors, nats.
         focal: Focal lengths in units of the noise, plain numbers.
     """
 
@@ -93,7 +93,7 @@ class ReprojectionCost(BlendedCost):
     target: Float[Tensor, "j 2"]
     pixel_noise: float
     potential: RobustPotential = Quadratic()
-    stabiliser: Stabiliser | None = Stabiliser()
+    nu: float = Stabiliser.nu
     focal: tuple[float, float] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -179,10 +179,7 @@ class ReprojectionCost(BlendedCost):
 
     def _value(self, x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
         *_, u, v = self._image(self._pose(x)[1])
-        value = 0.5 * self.potential(u * u + v * v).rho.sum(0)
-        if self.stabiliser is not None:
-            value = value + self._prior(x, None)[0]
-        return value
+        return 0.5 * self.potential(u * u + v * v).rho.sum(0) + self._prior(x, None)[0]
 
     def _local_model(self, x: Float[Tensor, "b n"], share: Float[Tensor, " b"] | None):
         """Value, gradient and Hessian; without `share` the exact one."""
@@ -215,19 +212,16 @@ class ReprojectionCost(BlendedCost):
             second_order_kinematics=True if share is None else share,
         )
         model = body.tied(model)
-        if self.stabiliser is not None:
-            value, slope, curvature = self._prior(x, share)
-            model.hessian.diagonal(dim1=-2, dim2=-1).add_(curvature)
-            model = LocalModel(model.value + value, model.gradient + slope, model.hessian)
-        return model
+        value, slope, curvature = self._prior(x, share)
+        model.hessian.diagonal(dim1=-2, dim2=-1).add_(curvature)
+        return LocalModel(model.value + value, model.gradient + slope, model.hessian)
 
     def _prior(self, x: Float[Tensor, "b n"], share: Float[Tensor, " b"] | None):
         """The sticky prior: value, gradient and the diagonal of its Hessian."""
-        assert self.stabiliser is not None
         inverse = self.body.sticky_deviation.reciprocal()
         z = (x - self.body.sticky_mean) * inverse
         z2 = z * z
-        rho, first, second = Lorentzian(nu=self.stabiliser.nu, sigma=self.stabiliser.nu**0.5)(z2)
+        rho, first, second = Lorentzian(nu=self.nu, sigma=self.nu**0.5)(z2)
         bend = 2.0 * second if share is None else (2.0 * share[:, None]) * second
         return 0.5 * rho.sum(-1), first * z * inverse, (first + bend * z2) * inverse.square()
 
@@ -236,22 +230,16 @@ class ReprojectionProblem(NamedTuple):
     """One problem of the study.
 
     Attributes:
-        body: The body, hung before the camera.
-        camera: The camera.
         truth: The pose that made the observations.
         joint_names: Names of the observed joint centres.
-        observed: Where they appear, noise included, pixels.
-        cost: What to minimise.
+        cost: What to minimise; it holds the body, hung before the camera, and what was observed.
         bounds: The joint limits.
         start: The minimum that the truth descends to; `mean`, `covariance` (of the free variables,
             decision "active bounds") and `cost` are those of the start mode.
     """
 
-    body: BodyModel
-    camera: Camera
     truth: Vector
     joint_names: tuple[str, ...]
-    observed: Float[Tensor, "j 2"]
     cost: ReprojectionCost
     bounds: Bounds
     start: Modes
@@ -263,7 +251,6 @@ def reprojection_problem(
     generator: torch.Generator,
     pixel_noise: float = 1.0,
     potential: RobustPotential | None = None,
-    stabiliser: Stabiliser | None = Stabiliser(),  # noqa: B008 (frozen)
     joint_names: tuple[str, ...] | None = None,
 ) -> ReprojectionProblem:
     """Draw a pose, its image, and make the problem of finding it again.
@@ -273,7 +260,6 @@ def reprojection_problem(
         generator: Source of the pose and of the noise.
         pixel_noise: Standard deviation of every image coordinate, pixels.
         potential: `rho` of the squared error in units of the noise; `Quadratic()` by default.
-        stabiliser: The sticky prior, or None.
         joint_names: The observed joint centres; all but those of face and foot by default.
 
     Raises:
@@ -288,18 +274,16 @@ def reprojection_problem(
     index = torch.tensor(body.joint_columns(names))
     exact = camera.project(body.pose(truth).joints[index]).uv
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
-    observed = exact + pixel_noise * noise
     cost = ReprojectionCost(
         body=body,
         camera=camera,
         index=index,
-        target=observed,
+        target=exact + pixel_noise * noise,
         pixel_noise=pixel_noise,
         potential=Quadratic() if potential is None else potential,
-        stabiliser=stabiliser,
     )
     start = TrustRegionNewton(max_steps=1000).minimise(cost, truth, body.bounds)
-    return ReprojectionProblem(body, camera, truth, names, observed, cost, body.bounds, start)
+    return ReprojectionProblem(truth, names, cost, body.bounds, start)
 
 
 def study_camera(name: str) -> Camera:

@@ -189,7 +189,7 @@ def study_problem(
     cost, truth, bounds = problem.cost, problem.truth, problem.bounds
     cost.body.sticky_deviation.mul_(choice.prior_scale)
     if pose is not None:
-        noise = problem.observed - _project(problem, truth)
+        noise = cost.target - _project(problem, truth)
         truth = torch.zeros_like(truth)
         truth[cost.body.state_columns(pose)] = truth.new_tensor([*pose.values()])
         truth = cost.body.bounds.project(truth)
@@ -199,14 +199,12 @@ def study_problem(
         bounds = Bounds(-infinite, infinite)
     variance = None if choice.widest is None else torch.full_like(truth, choice.widest**2)
     start = TrustRegionNewton(max_steps=1000).minimise(cost, truth, bounds, prior_variance=variance)
-    return problem._replace(
-        truth=truth, observed=cost.target, cost=cost, bounds=bounds, start=start
-    )
+    return problem._replace(truth=truth, cost=cost, bounds=bounds, start=start)
 
 
 def _project(problem: ReprojectionProblem, x: Vector) -> Float[Tensor, "j 2"]:
     joints = problem.cost.body.pose(x).joints[problem.cost.index]
-    return problem.camera.project(joints).uv
+    return problem.cost.camera.project(joints).uv
 
 
 def depth_flips(problem: ReprojectionProblem, x: Float[Tensor, "m n"]) -> dict[str, int]:
@@ -222,7 +220,7 @@ def depth_flips(problem: ReprojectionProblem, x: Float[Tensor, "m n"]) -> dict[s
         Numbers by the segment's name, the most frequent first; zeros are left out.
     """
     body = problem.cost.body
-    axis = problem.camera.R_camera_world[2].to(x)
+    axis = problem.cost.camera.R_camera_world[2].to(x)
     depth, at_start = (body.pose(state).joints @ axis for state in (x, problem.start.mean))
     counts = {}
     for name, ends in SEGMENTS.items():
