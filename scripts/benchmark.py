@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from common import QUARTILES, Table, quartiles, start, write_report
+from common import QUARTILES, Table, finish, peak_mib, quartiles, start
 from peers.autograd_cost import joints_by_autograd, made_up_costs, made_up_frames
 from torch import Tensor
 
@@ -114,12 +114,11 @@ def seconds_of(way: Callable[[Tensor], Any], x: Tensor) -> float:
 
 def measure_memory(config: Config, name: str) -> dict[str, float]:
     """Peak memory of this process with one way, and how much a few samples would need less."""
-    unit = 2**20 if sys.platform == "darwin" else 2**10
     evaluate, x = make_ways(config)[0][name]
     peaks = []
     for states in (x[:8], x):
         evaluate(states)
-        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit)
+        peaks.append(peak_mib(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
     return {"peak_mib": peaks[1], "added_mib": peaks[1] - peaks[0]}
 
 
@@ -174,11 +173,8 @@ def main(config: Config) -> dict[str, Any]:
     units = ("s per call", "1", "MiB", "1", "s per call", "s per frame")
     report = {"metrics": metrics, "unit": dict(zip(metrics, units, strict=True)), "config": config}
     report |= {"threads": torch.get_num_threads(), "torch": torch.__version__}
-    table = table_of(report)
-    table.print()
     tell(report)
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table_of(report))
 
 
 def table_of(report: dict[str, Any]) -> Table:

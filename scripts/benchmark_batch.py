@@ -28,7 +28,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import QUARTILES, Table, finish, quartiles, start
+from evaluate_posterior import find_clips
 
 from torchcss import CameraView, Settings, TrackingSession, read_camera, track_batch
 from torchcss.app.batch import Batch
@@ -81,12 +82,7 @@ class Prepared(NamedTuple):
 
 def folders(config: Config) -> list[Path]:
     """The clips."""
-    if config.data is None:
-        return [CLIP]
-    found = sorted(path.parent for path in config.data.glob("*/reference3d.npz"))
-    if not found:
-        raise ConfigurationError(f"{config.data}: no clip in it")
-    return found
+    return [CLIP] if config.data is None else find_clips(config.data)
 
 
 def films(config: Config) -> Iterator[Prepared]:
@@ -167,10 +163,7 @@ def batches(config: Config, workers: int) -> dict[str, Any]:
         for num in (1, workers)
     ]
     table = Table(f"`torchcss batch`, clips of {config.frames} frames", ("", "clips an hour"), rows)
-    table.print()
-    report = {"rounds": rounds}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, {"rounds": rounds}, table)
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -197,21 +190,18 @@ def main(config: Config) -> dict[str, Any]:
     for name, label in (("alone", "one after the other, frames a second"),
                         ("together", "side by side, frames a second"),
                         ("ratio", "ratio")):  # fmt: skip
-        quartiles = np.quantile([row[name] for row in rounds], (0.25, 0.5, 0.75))
-        rows.append([label, *map(float, quartiles)])
+        rows.append([label, *quartiles([row[name] for row in rounds]).values()])
     settings = config.settings
     title = (
         f"{config.sequences} sequences of {config.frames} frames, {settings.body}, "
         f"{settings.samples or 'default'} samples, {settings.engine} on {settings.device}"
     )
-    table = Table(title, ("", "lower quartile", "median", "upper quartile"), rows)
-    table.print()
+    columns = ("", *(name.replace("_", " ") for name in QUARTILES))
     same = all(row["same"] for row in rounds)
     print("the same bit for bit" if same else
           f"not the same bit for bit: {max(row['apart'] for row in rounds):.1e} apart")  # fmt: skip
     report = {"rounds": rounds, "settings": asdict(settings), "torch": torch.__version__}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, Table(title, columns, rows))
 
 
 if __name__ == "__main__":

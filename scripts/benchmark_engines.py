@@ -20,7 +20,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from jaxtyping import Float
 from torch import Tensor
 
@@ -143,10 +143,8 @@ def main(config: Config) -> dict[str, Any]:
             rows.append(row)
     columns = ("engine", "pool", "beside", "microseconds", "times the fused engine")
     table = Table("Evaluations of the whole cost", columns, [list(row.values()) for row in rows])
-    table.print()
     report = {"rows": rows, "config": config, "torch": torch.__version__}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 if __name__ == "__main__":

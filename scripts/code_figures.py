@@ -18,11 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from common import Table, start
+from common import REPOSITORY, Table, start, write_report
 
-from torchcss.io.tracks import prepare_output_folder, write_summary
-
-REPOSITORY = Path(__file__).resolve().parents[1]
 MOST_LINES = 50
 MOST_PARAMETERS = 8
 
@@ -76,9 +73,7 @@ def main(config: Config) -> dict[str, Any]:
     figures["lines"], figures["tokens"] = map(sum, zip(*figures["folders"].values(), strict=True))
     figures["arrows"] = sorted(f"{own} -> {other}" for own, other in arrows(package))
     print_figures(figures)
-    if config.out is not None:
-        prepare_output_folder(config.out.parent)
-        write_summary(config.out, figures)
+    write_report(config.out, figures)
     return figures
 
 

@@ -45,7 +45,7 @@ os.environ.setdefault(
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from peers.compiled_reprojection import CompiledReprojection
 from torch import Tensor
 
@@ -227,10 +227,7 @@ def main(config: Config) -> dict[str, Any]:
             pairs = zip(rows[OURS][rate], rows[name][rate], strict=True)
             ratios[f"{name}, {rate}"] = [mine / theirs for mine, theirs in pairs]
     report = {"solvers": rows, "our_rate_over_theirs": ratios, "config": config}
-    table = table_of(report)
-    table.print()
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table_of(report))
 
 
 def table_of(report: dict[str, Any]) -> Table:

@@ -34,7 +34,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
-from common import REPOSITORY, Table, start, write_report
+from common import REPOSITORY, Table, finish, peak_mib, start
 from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
@@ -141,8 +141,7 @@ def track(version: Path, words: list[str]) -> Measured:
         if process.returncode:
             raise ConfigurationError(f"{version}: {log.read_text(errors='replace')[-2000:]}")
         summary = json.loads((Path(folder) / "summary.json").read_text())
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return Measured(summary["seconds_per_frame"], seconds, usage.ru_maxrss / unit)
+    return Measured(summary["seconds_per_frame"], seconds, peak_mib(usage.ru_maxrss))
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -183,12 +182,10 @@ def main(config: Config) -> dict[str, Any]:
         f"times as fast as {config.against}",
     )
     table = Table(f"`torchcss track`, {config.frames} frames", columns, cells)
-    table.print()
     if config.plot is not None:
         save_figure(seconds_figure(config, rows), config.plot)
     report = {"frames": config.frames, "repeats": config.repeats, "rows": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def seconds_figure(config: Config, rows: dict[str, dict[str, Any]]) -> Figure:

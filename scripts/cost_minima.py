@@ -214,8 +214,6 @@ def curves_figure(
     panels: Mapping[str, Mapping[str, Float[np.ndarray, " s"]]],
     unit: plots.Unit,
     title: str,
-    *,
-    prominence: float = PROMINENCE,
 ) -> Figure:
     """Variants of one cost along one line: a panel per name, curves scaled to their own ranges.
 
@@ -224,7 +222,6 @@ def curves_figure(
         panels: Curves by panel and label, at most three to a panel.
         unit: How to show the offsets.
         title: What the whole figure shows.
-        prominence: Least prominence of a marked minimum.
     """
     figure = Figure(figsize=(9.0, 0.9 + 1.9 * len(panels)), layout="constrained")
     column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -234,7 +231,7 @@ def curves_figure(
             curves.items(), ("vermilion", "blue", "green"), strict=False
         ):
             height = (curve - curve.min()) / max(float(np.ptp(curve)), np.finfo(float).tiny)
-            at = curve_minima(height).above(prominence).sample
+            at = curve_minima(height).above(PROMINENCE).sample
             axes.plot(t, height, color=OKABE_ITO[colour], lw=1.3, label=f"{label}: {len(at)}")
             axes.plot(t[at], height[at], "o", mfc="none", mec=OKABE_ITO[colour], ms=5)
         plots.decorate(axes, unit if axes is column[-1] else plots.Unit(""))
@@ -246,7 +243,7 @@ def curves_figure(
         )
     figure.suptitle(
         f"{title}\ndotted: the truth; circles: minima with a prominence above "
-        f"{100 * prominence:g} % of the range",
+        f"{100 * PROMINENCE:g} % of the range",
         fontsize=10,
     )
     return figure
@@ -272,8 +269,6 @@ def counts_figure(
     thresholds: Float[np.ndarray, " m"],
     panels: Mapping[str, Sequence[CountCurve]],
     title: str,
-    *,
-    prominence: float = PROMINENCE,
 ) -> Figure:
     """How many minima the variants have compared with the first, whatever counts as a minimum.
 
@@ -281,7 +276,6 @@ def counts_figure(
         thresholds: Least prominences, shares of the range.
         panels: Variants by panel.
         title: What the whole figure shows.
-        prominence: The one that tables state, marked by a vertical line.
     """
     figure = Figure(figsize=(4.6 * len(panels), 4.6), layout="constrained")
     ticks = [t for t in PERCENTS if thresholds[0] <= t / 100 <= thresholds[-1]]
@@ -293,7 +287,7 @@ def counts_figure(
                 ls="--" if curve.dashed else "-", label=curve.label,
             )  # fmt: skip
         plots.decorate(axes, plots.Unit("least prominence counted (% of the slice's range)"))
-        axes.axvline(100 * prominence, color=plots.GREY, lw=0.8, ls=":")
+        axes.axvline(100 * PROMINENCE, color=plots.GREY, lw=0.8, ls=":")
         axes.axhline(1.0, color=plots.GREY, lw=0.8)
         axes.set_xscale("log")
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])

@@ -143,7 +143,7 @@ def look(scene: Scene, config: Config) -> list[dict[str, Any]]:
             drawn.append(pair)
     if config.out is not None:
         title = f"Cost of {scene.name}, by terms"
-        figure = slices_figure(drawn, title, prominence=config.prominence)
+        figure = slices_figure(drawn, title, config.prominence)
         save_figure(figure, config.out / f"slices_{scene.slug}.png")
     return rows
 
@@ -236,16 +236,13 @@ def displaced_minimum(scene: Scene, config: Config) -> dict[str, Any] | None:
 def slices_figure(
     rows: Sequence[tuple[tuple[Slice, plots.Unit], tuple[Slice, plots.Unit]]],
     title: str,
-    *,
-    centre: str = "mode",
-    prominence: float = PROMINENCE,
+    prominence: float,
 ) -> Figure:
     """One row per line: a small slice on the left, a large one on the right.
 
     Args:
         rows: The slices and how to show them.
         title: What the whole figure shows.
-        centre: What is at offset zero.
         prominence: See `draw_slice`.
     """
     figure = Figure(figsize=(9.0, 0.9 + 1.9 * len(rows)), layout="constrained")
@@ -253,7 +250,7 @@ def slices_figure(
     for axes_row, row in zip(grid, rows, strict=True):
         for axes, (sampled, unit) in zip(axes_row, row, strict=True):
             plots.draw_slice(axes, sampled, unit, prominence=prominence)
-        axes_row[0].set_ylabel(f"cost above that\nat the {centre} (nats)", fontsize=9)
+        axes_row[0].set_ylabel("cost above that\nat the mode (nats)", fontsize=9)
         for axes, scale in zip(axes_row, ("close", "as far as the limits admit"), strict=True):
             axes.set_title(f"{plots.title_of(row[0][0].line)}, {scale}", fontsize=10)
     entries: dict[str, Artist] = {}
@@ -266,7 +263,7 @@ def slices_figure(
         frameon=False, fontsize=9,
     )  # fmt: skip
     figure.suptitle(
-        f"{title}\ndotted: the {centre}; circles: minima of the sum with a prominence above "
+        f"{title}\ndotted: the mode; circles: minima of the sum with a prominence above "
         f"{100 * prominence:g} % of its range",
         fontsize=10,
     )

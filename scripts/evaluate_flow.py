@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from common.flow_files import flow_discontinuities, read_flow, with_potentials
 from torch import Tensor
 from torch.nn import functional
@@ -92,8 +92,7 @@ def main(config: Config) -> None:
     setting |= {"torch": torch.__version__, "threads": torch.get_num_threads()}
     cells = [[row["pair"], row["method"], *map(row.get, COLUMNS)] for row in rows]
     table = Table("Optical flow", ("pair", "method", *COLUMNS), cells)
-    table.print()
-    write_report(config.out, {"setting": setting, "rows": rows}, table)
+    finish(config.out, {"setting": setting, "rows": rows}, table)
 
 
 def timed(method: Method, pair: Pair) -> tuple[OpticalFlow | Tensor, float]:

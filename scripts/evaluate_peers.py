@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Table, start, write_report
+from common import Table, finish, start
 from evaluate_posterior import find_clips
 
 from torchcss import Run, read_camera, read_keypoints
@@ -106,10 +106,7 @@ def main(config: Config) -> dict[str, Any]:
         summed = [None if None in column else float(middle(column)) for column in columns]
         cells.append([name, None, None, *summed])
     table = Table("MediaPipe's 3D landmarks", HEADS, cells)
-    table.print()
-    report = {"frames": config.frames, "rows": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, {"frames": config.frames, "rows": rows}, table)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from jaxtyping import Float
 from torch import Tensor
 
@@ -220,13 +220,11 @@ def main(config: Config) -> dict[str, Any]:
     last = {"clip": "all together", "cal.": miss(pooled)}
     cells.append([last.get(name) for name in HEADS])
     table = Table(f"{len(by_clip)} clips, {config.seeds} seeds", HEADS, cells)
-    table.print()
     report = {
         "settings": asdict(config.tracking), "frames": config.frames, "rows": rows,
         "inside": pooled,
     }  # fmt: skip
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def miss(inside: Mapping[float, float]) -> float:

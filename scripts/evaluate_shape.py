@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 
 from torchcss.errors import ConfigurationError
 from torchcss.initialise.fit import initialise
@@ -76,9 +76,7 @@ def main(config: Config) -> dict[str, Any]:
                 )
     columns = ("sequence", "frame", "by", "overlap", "area", "root mm", "of all mm")
     table = Table("Outline of the first pose", columns, [[*r.values()] for r in report["rows"]])
-    table.print()
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def fit(

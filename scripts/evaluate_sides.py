@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Table, start, write_report
+from common import Table, finish, start
 
 from torchcss import read_motion_capture
 from torchcss.errors import ConfigurationError
@@ -103,10 +103,7 @@ def main(config: Config) -> dict[str, Any]:
     rows = [measure(rate, config, files) for rate in config.rates]
     cells = [[f"{row[0]:g}", *(f"{n:.0f}" for n in row[1:])] for row in rows]
     table = Table("Sides that are put back", HEADS, cells)
-    table.print()
-    report = {"motions": len(files), "rows": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, {"motions": len(files), "rows": rows}, table)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from common import Table, start, write_report
+from common import Table, finish, start
 
 from torchcss.app.view_files import open_view
 from torchcss.errors import ConfigurationError
@@ -78,10 +78,8 @@ def main(config: Config) -> dict[str, Any]:
         rows.append(["its detector", "", aligned, procrustes, "", "", "", ""])
     table = Table("A track", ("track", *columns, "lost"), rows)
     joints_table(report, columns).print()
-    table.print()
     tell(report)
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def evaluation(run: Run, config: Config) -> Evaluation:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from common import Table, start, write_report
+from common.comparison import body_of
 from peers.published import PUBLISHED
 from tqdm import tqdm
 
@@ -150,13 +151,12 @@ def groups_of(config: Config, done: set[tuple[str, int]]) -> Iterator[list[tuple
 def study_of(config: Config, sequence: RecordedSequence, thresholds: Thresholds) -> dict[str, Any]:
     """What all runs of a file have in common."""
     shared = ("start", "frames", "stop_when_lost", "small")
-    truth = sequence.truth
     tracked = {k: v for k, v in asdict(config.tracking).items() if k not in ("seed", "preset")}
     return {
         "sequence": sequence.name,
         "num_frames": sequence.num_frames,
         "frame_rate": sequence.frame_rate,
-        "body": config.tracked_as or (truth.body.name if truth else config.tracking.body),
+        "body": config.tracked_as or body_of(config.tracking, sequence),
         "thresholds": asdict(thresholds),
         "settings": {
             name: list(value) if isinstance(value, tuple) else value

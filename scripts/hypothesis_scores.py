@@ -15,6 +15,7 @@ hypotheses of a frame, and how many of the best k are the same.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,8 +23,8 @@ from statistics import median
 from typing import Any
 
 import torch
-from common import Table, start, write_report
-from common.comparison import Entrants, by_name, cells_of
+from common import Table, finish, start
+from common.comparison import Entrants, body_of, by_sequence, cells_of
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -33,7 +34,7 @@ from torchcss.inference.grid_tracker import GridTracker, by_edges
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.comparison import find_start, plan_of
-from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Settings
 from torchcss.types import CostFunction, LocalModel
 
@@ -129,25 +130,27 @@ def same_best(first: Float[Tensor, " m"], second: Float[Tensor, " m"], k: int) -
 
 
 def entrants(
-    config: Config, sequence: RecordedSequence, noted: list[tuple[float, float]], seed: int
+    config: Config,
+    noted: defaultdict[str, list[tuple[float, float]]],
+    sequence: RecordedSequence,
+    seed: int,
 ) -> Entrants:
     """The trackers of a seed by how their hypotheses are scored and laid out.
 
     Args:
         config: How to track.
+        noted: Where is kept, by sequence, what comes out where both scores are known, see `Scores`.
         sequence: What.
-        noted: Where is kept what comes out where both scores are known, see `Scores`.
         seed: The seed.
     """
-    body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
-    settings = replace(config.tracking, body=body, seed=seed)
+    settings = replace(config.tracking, body=body_of(config.tracking, sequence), seed=seed)
     begin = find_start(sequence, settings)
     plan = plan_of(sequence, settings, begin)
     tracker = plan.tracker
     if not isinstance(tracker, GridTracker):
         raise ConfigurationError(f"--preset: expected one of [RR], got {settings.preset!r}")
     ways = {
-        "edges": replace(tracker, scoring=Compared(tracker.num_modes, noted)),
+        "edges": replace(tracker, scoring=Compared(tracker.num_modes, noted[sequence.name])),
         "full": replace(tracker, scoring=by_the_whole_cost),
         "random": replace(tracker, pattern=CovarianceScaled(covariance_scale=1.0)),
     }
@@ -156,31 +159,26 @@ def entrants(
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    rows: dict[str, dict[str, Any]] = {}
-    cells = []
     seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
-    for folder in config.sequences:
-        sequence = read_sequence(folder)
-        noted: list[tuple[float, float]] = []
-        begin = partial(entrants, config, sequence, noted)
-        rows[sequence.name] = found = by_name(sequence, begin, seeds, config.frames)
-        if noted and "edges" in found:
-            ranks, shares = zip(*noted, strict=True)
+    noted: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
+    rows = by_sequence(config.sequences, partial(entrants, config, noted), seeds, config.frames)
+    for name, found in rows.items():
+        if noted[name] and "edges" in found:
+            ranks, shares = zip(*noted[name], strict=True)
             found["edges"] |= {"rank_correlation": median(ranks), "same_best": median(shares)}
-        for way, row in found.items():
-            cells.append([
-                f"{sequence.name}: {way}", *cells_of(row, *ERRORS),
-                row.get("rank_correlation"), row.get("same_best"),
-            ])  # fmt: skip
+    compared = ("rank_correlation", "same_best")
+    cells = [
+        [f"{name}: {way}", *cells_of(row, *ERRORS), *map(row.get, compared)]
+        for name, found in rows.items()
+        for way, row in found.items()
+    ]
     columns = (
         *("sequence: hypotheses", "lost", "best mode, mm", "best of modes, mm"),
         *("rank correlation", "same best"),
     )
     table = Table("How hypotheses are scored and laid out", columns, cells)
-    table.print()
     report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 if __name__ == "__main__":

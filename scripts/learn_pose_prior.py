@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from jaxtyping import Float
 from torch import Tensor
 
@@ -103,13 +103,11 @@ def main(config: Config) -> dict[str, Any]:
     rows.append(["uniform", uniform, uniform, math.nan, math.nan])
     columns = ("density", "train", "held out", "in 90 %", "calibration error")
     table = Table("Log density of poses", columns, rows)
-    table.print()
     if config.out is not None:
         write_mixtures(config.out, fits["mixtures"])
     numbers = {"train": len(learnt_from["trunk"]), "held_out": len(truth["trunk"])}
     report = {"setting": config, **numbers, "rows": rows}
-    write_report(config.report, report, table)
-    return report
+    return finish(config.report, report, table)
 
 
 def read_poses(config: Config) -> dict[str, Poses]:

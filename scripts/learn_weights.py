@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
@@ -157,10 +157,8 @@ def main(config: Config) -> dict[str, Any]:
     tracked = ("track mm", "best of modes mm") if config.track else ()
     columns = ("weights", *config.learnt, "minimum mm", *tracked)
     table = Table("Weights learnt from true states", columns, rows)
-    table.print()
     tell(report)
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def load(name: str, num_frames: int) -> Truth:

@@ -12,7 +12,6 @@ A film of `--opened` frames is opened besides, and the time until its first fram
 from __future__ import annotations
 
 import resource
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Table, start, write_report
+from common import Table, finish, peak_mib, start
 
 from torchcss.app.recorder import Picture
 from torchcss.app.track import TrackOptions, track_video
@@ -65,8 +64,7 @@ def memory_mib() -> float:
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
-        unit = 2**20 if sys.platform == "darwin" else 2**10
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+        return peak_mib(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     return pages * resource.getpagesize() / 2**20
 
 
@@ -131,10 +129,8 @@ def main(config: Config) -> dict[str, Any]:
     table = Table(
         f"One long run; a film of {config.opened} frames opens in {opening:.2f} s", columns, cells
     )
-    table.print()
     report = {"rows": watch.rows, "seconds_to_open": opening, "track_mb": size}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def _keypoints_for(num_frames: int, folder: Path) -> Path:

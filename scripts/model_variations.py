@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from common import Table, start, write_report
-from common.comparison import Entrants, by_name, cells_of
+from common import Table, finish, start
+from common.comparison import Entrants, body_of, by_sequence, cells_of
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
@@ -31,7 +31,7 @@ from torchcss.body.root import has_root
 from torchcss.body.shape import SHAPE_NAMES, with_shape
 from torchcss.cli.options import SettingsOptions
 from torchcss.studies.comparison import Start, find_start, plan_of
-from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Plan, Settings
 from torchcss.types import Bounds
 
@@ -109,7 +109,7 @@ def with_arms(body: BodyModel, factor: float) -> BodyModel:
 
 def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
     """The trackers of a seed by preset and variation."""
-    body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
+    body = body_of(config.tracking, sequence)
     found: dict[str, tuple[Settings, Start, Plan]] = {}
     begin = None
     for preset in config.presets:
@@ -131,22 +131,17 @@ def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    rows: dict[str, dict[str, Any]] = {}
-    cells = []
     seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
-    for folder in config.sequences:
-        sequence = read_sequence(folder)
-        found = by_name(sequence, partial(entrants, config, sequence), seeds, config.frames)
-        rows[sequence.name] = found
-        for name, row in found.items():
-            errors = cells_of(row, *ERRORS)
-            cells.append([f"{sequence.name}, {name}", *errors])
+    rows = by_sequence(config.sequences, partial(entrants, config), seeds, config.frames)
+    cells = [
+        [f"{sequence}, {name}", *cells_of(row, *ERRORS)]
+        for sequence, found in rows.items()
+        for name, row in found.items()
+    ]
     columns = ("sequence, tracker: variation", "lost", "best mode", "best of modes", "PA")
     table = Table("Parts of the model, changed one at a time", columns, cells)
-    table.print()
     report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 if __name__ == "__main__":

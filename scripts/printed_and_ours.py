@@ -17,13 +17,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from common import Table, start, write_report
-from common.comparison import Entrants, by_name, cells_of
+from common import Table, finish, start
+from common.comparison import Entrants, body_of, by_sequence, cells_of
 
 from torchcss.cli.options import SettingsOptions
 from torchcss.inference.tracker import Tracker
 from torchcss.studies.comparison import Start, find_start, plan_of
-from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Plan, Settings
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm", "pa_mpjpe_mm"
@@ -93,7 +93,7 @@ EXCHANGES: dict[str, Callable[[Plan, Plan], Plan]] = {
 
 def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
     """All trackers of a seed by name."""
-    body = config.tracking.body if sequence.truth is None else sequence.truth.body.name
+    body = body_of(config.tracking, sequence)
     found: dict[str, tuple[Settings, Start, Plan]] = {}
     begin = None
     for end, presets in ENDS.items():
@@ -111,21 +111,17 @@ def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    rows, cells = {}, []
     seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
-    for folder in config.sequences:
-        sequence = read_sequence(folder)
-        found = by_name(sequence, partial(entrants, config, sequence), seeds, config.frames)
-        rows[sequence.name] = found
-        for name, row in found.items():
-            errors = cells_of(row, *ERRORS)
-            cells.append([f"{sequence.name}: {name}", *errors, row["search_s_per_frame"][0]])
+    rows = by_sequence(config.sequences, partial(entrants, config), seeds, config.frames)
+    cells = [
+        [f"{sequence}: {name}", *cells_of(row, *ERRORS), row["search_s_per_frame"][0]]
+        for sequence, found in rows.items()
+        for name, row in found.items()
+    ]
     columns = ("sequence: tracker", "lost", "best mode", "best of modes", "PA", "search, s/frame")
     table = Table("As printed against ours, part by part", columns, cells)
-    table.print()
     report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 if __name__ == "__main__":

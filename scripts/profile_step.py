@@ -44,7 +44,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import Table, quartiles, start, write_report
+from common import Table, finish, quartiles, start
 from matplotlib.figure import Figure
 from peers.tracker_step import (
     Step,
@@ -212,9 +212,7 @@ def main(config: Config) -> dict[str, Any]:
     title = f"A step eager, compiled and fused, {config.dtype} on {config.device}"
     columns = ("body", "microseconds", "times as fast", "MiB", "library's share")
     table = Table(title, columns, [cells_of(row, name) for row in rows for name in _ways(row)])
-    table.print()
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 if __name__ == "__main__":

@@ -89,10 +89,10 @@ class Plane:
         return LocalModel(model.value, model.gradient @ self.basis, hessian)
 
 
-def ellipse(axis: Axes, covariance: Tensor, scale: float, **style: Any) -> None:
-    """Draw the curve at so many standard deviations."""
+def ellipse(axis: Axes, covariance: Tensor, **style: Any) -> None:
+    """Draw the curve at two standard deviations."""
     values, vectors = torch.linalg.eigh(covariance)
-    width, height = (2 * scale * values.sqrt()).tolist()
+    width, height = (4 * values.sqrt()).tolist()
     angle = np.degrees(np.arctan2(float(vectors[1, 0]), float(vectors[0, 0])))
     axis.add_patch(Ellipse((0, 0), width, height, angle=angle, fill=False, **style))
 
@@ -110,10 +110,10 @@ def picture(
     for axis, (name, (row, raw, modes, kept)) in zip(axes, runs.items(), strict=True):
         axis.plot(*raw.T, ".", ms=4, color="#D55E00", label="samples")
         axis.plot(*modes.mean[kept].T, "*", ms=13, color="#0072B2", label="minima found")
-        ellipse(axis, own, 2, ls="--", lw=1.5, color="#009E73")
+        ellipse(axis, own, ls="--", lw=1.5, color="#009E73")
         shape = {"CONDENSATION": noise**2 * torch.eye(2), "MHT": own + noise**2 * torch.eye(2)}
         scaled = config.deviation_scale**2 * own
-        ellipse(axis, shape.get(name, scaled).double(), 2, lw=1.5, color="#D55E00")
+        ellipse(axis, shape.get(name, scaled).double(), lw=1.5, color="#D55E00")
         axis.set(xlim=(-config.reach, config.reach), ylim=(-config.reach, config.reach))
         axis.set_xlabel(f"eigen-direction {config.directions[0]} (rad)")
         axis.set_title(

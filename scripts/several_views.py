@@ -26,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from jaxtyping import Float
 from torch import Tensor
 
@@ -137,10 +137,7 @@ def main(config: Config) -> dict[str, Any]:
     for name, study in ((BEAM, person), (BOARD, board)):
         if name in config.what:
             report[name] = study(config, config.data / name)
-    table = table_of(report)
-    table.print()
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table_of(report))
 
 
 def person(config: Config, folder: Path) -> dict[str, Any]:

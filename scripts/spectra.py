@@ -25,7 +25,8 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
+from common.comparison import body_of
 from jaxtyping import Float
 from torch import Tensor
 
@@ -114,7 +115,7 @@ def main(config: Config) -> dict[str, Any]:
     cells: list[list[str | float | None]] = []
     for folder in config.sequences:
         sequence = read_sequence(folder)
-        own = config.tracking.body if sequence.truth is None else sequence.truth.body.name
+        own = body_of(config.tracking, sequence)
         found[sequence.name] = runs = []
         for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
             runs.append(
@@ -126,10 +127,7 @@ def main(config: Config) -> dict[str, Any]:
         cells.append([f"joints in one image, {body}", *medians(runs)])
     columns = ("sequence, body", "largest over smallest", "volume, power of 10", "floored")
     table = Table("Spectra of the image's cost", columns, cells)
-    table.print()
-    report = {"frames": config.frames, "by_sequence": found}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, {"frames": config.frames, "by_sequence": found}, table)
 
 
 def medians(runs: list[dict[str, Any]]) -> list[float]:

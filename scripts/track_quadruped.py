@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from common import Table, start, write_report
+from common import Table, finish, start
 from torch import Tensor
 
 from torchcss.body.load import FileOptions, load_body
@@ -136,8 +136,7 @@ def main(config: Config) -> dict[str, Any]:
     columns = ("links mm", "worst frame mm", "base mm", "feet mm")
     cells = [report[c.replace(" ", "_")] for c in columns]
     table = Table("A trotting quadruped", ("cameras", *columns), [[config.cameras, *cells]])
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 if __name__ == "__main__":

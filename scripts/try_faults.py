@@ -42,7 +42,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Table, start, write_report
+from common import Table, finish, start
 
 from torchcss.app.batch import MOST_DEATHS, Batch
 from torchcss.io.tracks import load_track
@@ -50,17 +50,10 @@ from torchcss.studies.demo import CLIP
 from torchcss.tracking.settings import Settings
 
 SETTINGS = Settings(body="arm8", samples=8, modes=2, keypoints_use="first", overlay=False)
-_WORDS = [
-    "--body",
-    "arm8",
-    "--samples",
-    "8",
-    "--modes",
-    "2",
-    "--keypoints-use",
-    "first",
-    "--no-overlay",
-]
+_WORDS = (
+    *("--body", "arm8", "--samples", "8", "--modes", "2"),
+    *("--keypoints-use", "first", "--no-overlay"),
+)
 _SOON_S, _LATE_S, _POLL_S = 10.0, 300.0, 0.02
 _SMALL = 12_000
 """Bytes of a file that is smaller than a track of some frames."""
@@ -365,10 +358,8 @@ def main(config: Config) -> dict[str, Any]:
             shutil.rmtree(batch.folder)
         print(*rows[-1], flush=True)
     table = Table("Batches disturbed", ("fault", "rounds", "lost"), summed(rows))
-    table.print()
     report = {"rounds": len(rows), "lost": table.rows[-1][2], "rows": rows}
-    write_report(config.out, report, table)
-    return report
+    return finish(config.out, report, table)
 
 
 def summed(rows: Sequence[Sequence[Any]]) -> list[list[str | float | None]]:

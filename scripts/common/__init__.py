@@ -50,6 +50,11 @@ def quartiles(values: Sequence[float]) -> dict[str, float]:
     return {name: float(np.quantile(values, q)) for name, q in QUARTILES.items()}
 
 
+def peak_mib(maxrss: int) -> float:
+    """The most memory that a process ever had, MiB, as its `ru_maxrss` says."""
+    return maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
 class Table(NamedTuple):
     """Rows to be shown.
 
@@ -107,6 +112,13 @@ def write_report(path: Path | None, report: Mapping[str, Any], table: Table | No
     prepare_output_folder(path.parent)
     shown = {} if table is None else {"table": table._asdict()}
     write_summary(path, {**made_by(), **report, **shown})
+
+
+def finish(path: Path | None, report: dict[str, Any], table: Table) -> dict[str, Any]:
+    """Print a table, and write the report (`write_report`), which is returned."""
+    table.print()
+    write_report(path, report, table)
+    return report
 
 
 def made_by() -> dict[str, str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from torchcss.studies.comparison import Start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
-from torchcss.studies.sequences import RecordedSequence
+from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Plan, Settings
 
 Entrants = Mapping[str, tuple[Settings, Start, Plan]]
@@ -44,30 +45,39 @@ def summaries(
                 yield names[run.number], {"ended": run.ended, **summary}
 
 
-def by_name(
-    sequence: RecordedSequence,
-    entrants: Callable[[int], Entrants],
+def by_sequence(
+    folders: Iterable[Path],
+    entrants: Callable[[RecordedSequence, int], Entrants],
     seeds: Iterable[int],
     frames: int,
-) -> dict[str, dict[str, Any]]:
-    """Run the trackers of several seeds.
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Run the trackers of several seeds on several sequences.
 
     Args:
-        sequence: What is tracked.
-        entrants: The trackers of a seed.
+        folders: The sequences.
+        entrants: The trackers of a sequence and a seed.
         seeds: The seeds.
-        frames: How many frames, where the sequence has as many.
+        frames: How many frames, where a sequence has as many.
 
     Returns:
-        Of each tracker that was measured median, least and greatest of its numbers (`over_seeds`).
+        By sequence and tracker that was measured median, least and greatest of its numbers
+        (`over_seeds`).
     """
-    runs: dict[str, list[dict[str, Any]]] = {}
-    for seed in seeds:
-        named = entrants(seed)
-        runs |= {name: runs.get(name, []) for name in named}
-        for name, summary in summaries(sequence, named, frames):
-            runs[name].append(summary)
-    return {name: over_seeds(each) for name, each in runs.items() if each}
+    found = {}
+    for folder in folders:
+        sequence, runs = read_sequence(folder), {}
+        for seed in seeds:
+            named = entrants(sequence, seed)
+            runs |= {name: runs.get(name, []) for name in named}
+            for name, summary in summaries(sequence, named, frames):
+                runs[name].append(summary)
+        found[sequence.name] = {name: over_seeds(each) for name, each in runs.items() if each}
+    return found
+
+
+def body_of(tracking: Settings, sequence: RecordedSequence) -> str:
+    """The body that tracks a sequence: the one that moved, if that is known."""
+    return tracking.body if sequence.truth is None else sequence.truth.body.name
 
 
 def cells_of(row: Mapping[str, Any], *keys: str) -> list[str]:

@@ -7,7 +7,7 @@ import torch
 
 from torchcss import load_body
 from torchcss.body.catalog import BODY_NAMES
-from torchcss.body.uncertainty import Held, joint_covariance, joint_jacobian
+from torchcss.body.uncertainty import Held, joint_covariance, point_jacobian
 from torchcss.errors import ShapeError
 
 
@@ -17,7 +17,8 @@ def test_jacobian_is_autograd_s(name: str, generator: torch.Generator):
     turn = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
     body = body.with_base(turn * turn.det(), torch.tensor([1.0, -2.0, 3.0]))
     x = 0.3 * torch.randn(2, body.num_parameters, generator=generator, dtype=torch.float64)
-    found = joint_jacobian(body, body.pose(x))
+    pose = body.pose(x)
+    found = point_jacobian(body, pose.tree, pose.joints, body.marker_link)
     for item, ours in zip(x, found, strict=True):
         exact = torch.autograd.functional.jacobian(lambda state: body.pose(state).joints, item)
         torch.testing.assert_close(ours, exact, rtol=0, atol=1e-12)

@@ -16,7 +16,7 @@ from torchcss.body.bases import pose_track
 from torchcss.body.catalog import BODY_NAMES, specification
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
-from torchcss.body.uncertainty import joint_jacobian
+from torchcss.body.uncertainty import point_jacobian
 from torchcss.errors import BodyError, TrackFileError
 from torchcss.io.run import body_of_track
 from torchcss.io.track_body import PARAMETER_NUMBERS, body_from_plain, body_to_plain
@@ -91,9 +91,11 @@ def test_twists_stand_on_the_base():
     state = torch.from_numpy(track.state[1, :2])
     placed = body.with_base(torch.from_numpy(base[:3, :3]), torch.from_numpy(base[:3, 3]))
     found = pose_track(body_of_track(track), state, torch.from_numpy(base))
-    torch.testing.assert_close(
-        joint_jacobian(body, found), joint_jacobian(body, placed.pose(state))
+    here, there = (
+        point_jacobian(body, pose.tree, pose.joints, body.marker_link)
+        for pose in (found, placed.pose(state))
     )
+    torch.testing.assert_close(here, there)
 
 
 def test_a_given_body_is_checked_and_left_alone():

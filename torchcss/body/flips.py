@@ -28,9 +28,6 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.joint_names import JOINT_NAMES
 
-TRUNK_GROUPS = ("trunk", "hips", "shoulders", "head")
-"""Groups of segments that are not limbs; both halves of hips and of shoulders flip as one."""
-
 _TRUNK: dict[str, tuple[str, str]] = {
     "vt1": ("HumanoidRoot", "trunk"),
     "l_hip": ("HumanoidRoot", "hips"),
@@ -70,7 +67,8 @@ class Segments:
 
     Attributes:
         joint: The body's joint centres that take part, parents before children.
-        groups: Names of the groups that flip as one.
+        groups: Names of the groups that flip as one, as both halves of hips and of shoulders do.
+        trunk: Those of the trunk without the head.
         limbs: Arms and legs.
     """
 
@@ -93,6 +91,7 @@ class Segments:
             body.joint_columns(names), dtype=torch.long, device=body.tie.device
         )
         self.groups = tuple(dict.fromkeys(group for _, group in rows.values()))
+        self.trunk = [name for name in ("trunk", "hips", "shoulders") if name in self.groups]
         # Parent and group of every joint; roots have none.
         self._rows = [
             (names.index(name), names.index(parent), self.groups.index(group))
@@ -107,11 +106,6 @@ class Segments:
         )
         # The limb of a body from a file may have no joint that turns.
         self.limbs = tuple(limb for limb in found if limb.columns.numel())
-
-    @property
-    def trunk(self) -> tuple[str, ...]:
-        """Groups of this body's trunk."""
-        return tuple(group for group in TRUNK_GROUPS if group in self.groups)
 
     def flip(
         self,

@@ -9,7 +9,7 @@ tracked, and is in no state's covariance. `Held` says how little is known of it,
 joints by their sensitivity: a body that is larger by a share s and farther by the same share looks
 the same, and so does one that is farther by a share f before a lens that is longer by it.
 
-Call `joint_covariance`; `joint_jacobian` gives J alone.
+Call `joint_covariance`; `point_jacobian` gives J alone.
 """
 
 from __future__ import annotations
@@ -59,20 +59,10 @@ class Held(NamedTuple):
         return found + (self.focal * depth).square() * torch.outer(axis, axis)
 
 
-def joint_jacobian(body: BodyModel, pose: BodyPose) -> Float[Tensor, "*batch j 3 n"]:
-    """Derivatives of the joint centres in the state, metres per radian or metre.
-
-    Args:
-        body: The body.
-        pose: What `body.pose` gave.
-    """
-    return point_jacobian(body, pose.tree, pose.joints, body.marker_link)
-
-
 def point_jacobian(
     body: BodyModel, tree: TreePose, points: Float[Tensor, "*batch p 3"], link: Int[Tensor, " p"]
 ) -> Float[Tensor, "*batch p 3 n"]:
-    """The same of any points.
+    """Derivatives of points in the state, metres per radian or metre.
 
     Args:
         body: The body.
@@ -111,7 +101,7 @@ def joint_covariance(
         ShapeError: If the covariance has another size than the state.
     """
     check_shape("covariance", covariance, body.num_parameters, body.num_parameters)
-    jacobian = joint_jacobian(body, pose)
+    jacobian = point_jacobian(body, pose.tree, pose.joints, body.marker_link)
     if about:
         jacobian = jacobian - jacobian[..., list(about), :, :].mean(-3, keepdim=True)
     found = jacobian @ covariance[..., None, :, :] @ jacobian.mT

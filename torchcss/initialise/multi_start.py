@@ -192,9 +192,11 @@ def multi_start_fits(
     return optimise(cost, x, bounds, search.max_steps)
 
 
-def optimise(cost: TrackingCost, x: Vectors, bounds: Bounds, steps: int) -> Modes:
+def optimise(
+    cost: TrackingCost, x: Vectors, bounds: Bounds, steps: int, *, tolerance: float = 1e-2
+) -> Modes:
     """Descend to a hundredth of a nat, which tells fits apart, in so many steps at the most."""
-    fits = TrustRegionNewton(max_steps=steps, tolerance=1e-2).minimise(cost, x, bounds)
+    fits = TrustRegionNewton(max_steps=steps, tolerance=tolerance).minimise(cost, x, bounds)
     return fits._replace(mean=unwound(cost.body, fits.mean))
 
 
@@ -282,14 +284,13 @@ def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, nu
         num: How many states to return, at the most.
     """
     body, device = cost.body, x.device
-    trunk = [g for g in segments.trunk if g != "head"]
     # The hand of a body moves with its forearm; that of an arm has joints of its own.
     depth = 2 if len(segments.limbs) > 1 else 3
-    ways = [_all_ways(len(trunk), device), _all_ways(depth, device)]
+    ways = [_all_ways(len(segments.trunk), device), _all_ways(depth, device)]
     flipped = torch.zeros(
         len(ways[0]), len(ways[1]), len(segments.groups), dtype=torch.bool, device=device
     )
-    for bit, group in enumerate(trunk):
+    for bit, group in enumerate(segments.trunk):
         flipped[:, :, segments.groups.index(group)] = ways[0][:, None, bit]
     for limb in segments.limbs:
         for bit, group in enumerate(limb.groups[:depth]):

@@ -25,12 +25,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.body.root import unwound
 from torchcss.cost.joints import JointTargets, JointTerm, match_joints
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import distinct_modes
-from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.initialise.multi_start import StartSearch, descend_widened, multi_start_fits
+from torchcss.initialise.multi_start import (
+    StartSearch,
+    descend_widened,
+    multi_start_fits,
+    optimise,
+)
 from torchcss.types import Modes, Numbers, Vectors
 
 SHARE = 0.05
@@ -113,10 +116,8 @@ def _put_back(
         fewer[column] = False
         tried = refine_fits(without(cost, fewer), fits.mean[:_NUM_TRIED], search)
         if float(tried.cost.min()) < float(fits.cost[0] + price[column]):
-            fits, outliers = (
-                best_distinct(refine_fits(without(cost, fewer), fits.mean, search)),
-                fewer,
-            )
+            fits = best_distinct(refine_fits(without(cost, fewer), fits.mean, search))
+            outliers = fewer
     return fits, outliers
 
 
@@ -158,8 +159,7 @@ def refine_fits(cost: TrackingCost, x: Vectors, search: StartSearch) -> Modes:
     """Descend from fits to other keypoints or lengths: wide at first, then to the end."""
     bounds = search.bounds(cost.body)
     x = descend_widened(cost, x, bounds, ((4.0, 8),))
-    fits = TrustRegionNewton(max_steps=60, tolerance=1e-3).minimise(cost, x, bounds)
-    return fits._replace(mean=unwound(cost.body, fits.mean))
+    return optimise(cost, x, bounds, 60, tolerance=1e-3)
 
 
 def best_distinct(fits: Modes, num: int | None = None) -> Modes:

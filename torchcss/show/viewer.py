@@ -26,7 +26,7 @@ import io
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -108,12 +108,21 @@ def view_track(
             if the recording cannot be written.
     """
     rows_with_modes(run.track)
-    if save is None:
-        _replay(run, None, connect, anew)
-        return
-    prepare_output_folder(save.parent)
-    with replace_file(save) as partial:
-        _replay(run, partial, connect, anew)
+    track, camera = run.track, run.cameras[0].camera if run.cameras else None
+    best = track.joints_world[:, 0]
+    up, _ = up_axis(track.joint_names, best, track.base_transform, camera_up(camera))
+    events = bool(run.summary.get("events"))
+    if save is not None:
+        prepare_output_folder(save.parent)
+    with nullcontext() if save is None else replace_file(save) as partial:
+        recording = open_recording(run.folder.resolve().name, save=partial, connect=connect)
+        try:
+            viewer = Viewer(recording, run.body, camera=camera, up=up, events=events)
+            frames = shown_frames(run, anew=anew)
+            for frame in tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True):
+                viewer.add(frame)
+        finally:
+            close_recording(recording)
 
 
 def shown_frames(run: Run, *, anew: bool = False) -> Iterator[ShownFrame]:
@@ -130,21 +139,6 @@ def shown_frames(run: Run, *, anew: bool = False) -> Iterator[ShownFrame]:
         modes = run.track.modes(row)
         lost = changes.get(modes.frame, "lost" if lost else "found") == "lost"
         yield ShownFrame(modes, next(pictures, (row, None))[1], lost)
-
-
-def _replay(run: Run, save: Path | None, connect: str | None, anew: bool) -> None:
-    track, camera = run.track, run.cameras[0].camera if run.cameras else None
-    best = track.joints_world[:, 0]
-    up, _ = up_axis(track.joint_names, best, track.base_transform, camera_up(camera))
-    events = bool(run.summary.get("events"))
-    recording = open_recording(run.folder.resolve().name, save=save, connect=connect)
-    try:
-        viewer = Viewer(recording, run.body, camera=camera, up=up, events=events)
-        frames = shown_frames(run, anew=anew)
-        for frame in tqdm(frames, total=len(track.frames), unit="frame", dynamic_ncols=True):
-            viewer.add(frame)
-    finally:
-        close_recording(recording)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

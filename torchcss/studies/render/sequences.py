@@ -146,15 +146,12 @@ def film_parts(
     )
 
 
-def arm_sequence(
-    *, generator: torch.Generator, num_frames: int = 50, frame_rate: float = 25.0
-) -> SyntheticSequence:
+def arm_sequence(*, generator: torch.Generator, num_frames: int = 50) -> SyntheticSequence:
     """Render the demo's sequence.
 
     Args:
         generator: Source of the room, the textures and the sensor noise.
-        num_frames: Number of frames.
-        frame_rate: Frames per second.
+        num_frames: Number of frames, 25 per second.
 
     Raises:
         ConfigurationError: If there is to be no frame.
@@ -165,6 +162,7 @@ def arm_sequence(
     shoulder = torch.tensor([0.30, 0.16, -1.75], dtype=torch.float64)
     body = load_body("arm8").with_base(torch.eye(3, dtype=torch.float64), shoulder)
     camera = look_at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), focal_px=640.0, name="demo")
+    frame_rate = 25.0
     times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
     background = clutter_background(480, 640, generator=generator)
     textures = [random_texture(generator=generator) for _ in body.part_names]
