@@ -81,6 +81,17 @@ def test_a_mimic_joint_of_nothing_is_free(tmp_path: Path) -> None:
     assert any("'l_b' mimics 'a'" in note for note in body.notes)
 
 
+def test_numbers_in_other_units_are_told(tmp_path: Path) -> None:
+    path = urdf(tmp_path, joint("a", "base", "b"), joint("c", "b", "d"))
+    assert len(load_body(path).notes) == 1
+    path.write_text(path.read_text().replace('"-1" upper="1.5"', '"-90" upper="90"', 1))
+    assert "a.urdf: joints whose limits are far apart, ['a']: they" in load_body(path).notes[1]
+    path.write_text(path.read_text().replace('xyz="0 0 0.3"', 'xyz="0 0 300"'))
+    assert load_body(path).notes[2] == (
+        "a.urdf: it reaches 600 m: a file in millimetres takes scale=0.001"
+    )
+
+
 def test_prefixes_that_nobody_declares(tmp_path: Path) -> None:
     path = urdf(
         tmp_path,
@@ -148,6 +159,16 @@ def test_a_skeleton_without_motion(tmp_path: Path, motion: str) -> None:
     assert any("no motion" in note for note in body.notes)
     with pytest.raises(MotionCaptureError, match="without motion"):
         read_motion_capture(path)
+
+
+def test_a_bvh_with_decimal_commas(tmp_path: Path) -> None:
+    rows = "MOTION\nFrames: 2\nFrame Time: 0.0333333\n{rows}\n{rows}\n"
+    path = tmp_path / "a.bvh"
+    path.write_text("\ufeff" + bvh(motion=rows).replace(".", ",").replace("\n", "\r\n"))
+    motion = read_motion_capture(path)
+    assert motion.frame_rate == 30
+    path.write_text(bvh(motion=rows))
+    np.testing.assert_array_equal(motion.joints, read_motion_capture(path).joints)
 
 
 def test_z_up(tmp_path: Path) -> None:

@@ -312,6 +312,7 @@ def test_variable_frame_rates(tmp_path: Path) -> None:
     means = [round(frame.image.mean()) for frame in reader]
     assert means == pytest.approx([grey_level(index) for index in range(30)], abs=3)
     assert float(reader.info.frame_rate) == pytest.approx(30 * 30 / ticks[-1], rel=0.1)
+    assert "are shown for 33 to 100 ms (variable frame rate)" in str(reader.varying_rate())
 
 
 def test_an_edit_list_hides_frames(tmp_path: Path) -> None:

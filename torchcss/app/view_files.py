@@ -66,6 +66,7 @@ class OpenView(NamedTuple):
     def notes(self) -> list[str]:
         """What the files' readers have to say, for the user."""
         notes = [self.camera.units_note, *camera_findings(self.camera.camera)]
+        notes += [self.reader.varying_rate()]
         if self.reader.image_names is not None:
             given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
             notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")

@@ -52,6 +52,9 @@ from torchcss.types import frozen
 
 BODY_SUFFIXES = (".urdf", ".xml", ".mjcf", ".bvh", ".xacro")
 
+_LARGEST = 50.0
+"""Metres that a body reaches from its root: more are another unit."""
+
 _AS_IT_IS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _BVH_Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """Z up to Y up, what faced -Y facing +Z."""
@@ -182,6 +185,10 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
             while name in taken:
                 name += "_bone"
             parts += (replace(part, name=name),)
+    notes, poses = skeleton.notes, rest_poses(joints)
+    reach = max(float(np.linalg.norm(poses[link][:3, 3])) for link in skeleton.places)
+    if reach > _LARGEST:
+        notes += (f"it reaches {reach:.0f} m: a file in millimetres takes scale=0.001",)
     markers = [
         MarkerSpecification(name=landmarks.get(link, link), link=link) for link in skeleton.places
     ]
@@ -194,7 +201,7 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
         sticky=skeleton.sticky,
         neighbours=touching_parts(joints, parts),
         lengths={},
-        notes=tuple(f"{path.name}: {note}" for note in skeleton.notes),
+        notes=tuple(f"{path.name}: {note}" for note in notes),
     )
 
 

@@ -109,6 +109,7 @@ class VideoReader:
 
     info: VideoInfo
     pixel_aspect = Fraction(1)
+    _is_even = True
 
     def __init__(
         self,
@@ -176,6 +177,18 @@ class VideoReader:
         begin = min(times, default=0.0)
         return sorted(time - begin for time in times) if self.count_frames() == len(times) else None
 
+    def varying_rate(self) -> str | None:
+        """A line about frames that are not shown for equally long; None: they are."""
+        steps = np.diff([] if self._is_even else self.frame_times() or [])
+        mean = 1 / float(self.info.frame_rate)
+        if not len(steps) or np.ptp(steps) < 0.5 * mean:
+            return None
+        shortest, longest, mean = (f"{1000 * t:.0f}" for t in (steps.min(), steps.max(), mean))
+        return (
+            f"frames are shown for {shortest} to {longest} ms (variable frame rate): motion is "
+            f"expected as in {mean} ms, the mean, in each; the track has the frames' own times"
+        )
+
     def _shown_at(self) -> list[float | None]:
         """When each frame of a container is shown, in the order in which they are stored."""
         times: list[float | None] = []
@@ -237,6 +250,7 @@ class VideoReader:
                     raise self._not_a_video("it holds no pictures")
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate or stream.base_rate
+                self._is_even = stream.average_rate in (None, stream.base_rate)
                 num_frames = stream.frames or None
                 duration = (stream.duration or 0) * (stream.time_base or 0) * (rate or 0)
                 if num_frames and duration and "mp4" in container.format.name:

@@ -1259,3 +1259,150 @@ def test_y_that_counts_upwards_is_told(tmp_path: Path) -> None:
 def test_files_of_other_kinds(tmp_path: Path, name: str, words: str) -> None:
     with pytest.raises(KeypointError, match=words):
         read(write(tmp_path / name, "a: 1"))
+
+
+# What programs of other versions write.
+
+
+def headed(rows: dict[str, np.ndarray], first: str = "frame", factor: float = 1.0) -> str:
+    """A table of joints, a row each; what is first in a row stands for its frame."""
+    lines = [",".join([first, *(f"{n}_{part}" for n in TFJS for part in ("x", "y", "conf"))])]
+    lines += [",".join(map(str, [key, *(of * (1, 1, factor)).ravel()])) for key, of in rows.items()]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("word", "code"),
+    [
+        ("timestamp", "00:00:00.{:03d}"),
+        ("timecode", "0:00,{:03d}"),
+        ("time_s", "00:00.{:03d}"),
+        ("timestamp", "2024-05-03 10:15:30.{:03d}"),
+        ("Time", "2024-05-03T10:15:30.{:03d}Z"),
+    ],
+)
+def test_times_as_text(tmp_path: Path, word: str, code: str) -> None:
+    codes = {code.format(40 * t): person(t) for t in SEEN}
+    text = headed(codes, word)
+    text = text.replace(",", ";").replace("0:00;", "0:00,") if "," in code else text
+    path = write(tmp_path / "a.csv", text.replace("\n", "\r\n"))
+    check(read(path, frame_rate=25.0), (3,))
+    entries = [{word: key, "keypoints": of.tolist()} for key, of in codes.items()]
+    check(read(write(tmp_path / "a.json", entries), frame_rate=25.0), (3,))
+
+
+def test_whole_seconds_as_text_are_seconds(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", headed({f"00:0{t}": person(t) for t in SEEN}, "timestamp"))
+    check(read(path, frame_rate=1.0), (3,))
+    path = write(tmp_path / "a.json", [{"timestamp": f"0:0{t}", "joints": person(t).tolist()}
+                                       for t in SEEN])  # fmt: skip
+    check(read(path, frame_rate=1.0), (3,))
+
+
+def test_a_time_code_that_counts_frames_is_left_out(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", headed({f"01:00:00:0{t}": person(t) for t in T}, "timecode"))
+    found = read(path)
+    check(found)
+    assert "columns left out: 'timecode'" in found.report
+
+
+def test_confidences_in_percent(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.csv", headed({f"{t}": person(t) for t in T}, factor=100))
+    found = read(path)
+    check(found)
+    assert "confidences run to 88: they are taken for percent" in found.report
+    np.testing.assert_allclose(found.confidence[0], person(0)[:, 2])
+    write(path, headed({f"{t}": person(t) for t in T}, factor=20))
+    with pytest.raises(KeypointError, match=r"confidence 17\.6; expected 0 to 1"):
+        read(path)
+
+
+@pytest.mark.parametrize("form", ["pictures", "video", "names as text"])
+def test_via_from_version_3_on(tmp_path: Path, form: str) -> None:
+    marks: dict[str, Any] = {
+        f"{t}_{i}": {"vid": "1" if form == "video" else f"{t + 1}", "flg": 0,
+                     "z": [t / 25] if form == "video" else [], "xy": [1, x, y],
+                     "av": {"1": TFJS[i] if form == "names as text" else f"{i}"}}
+        for t in SEEN for i, (x, y, _) in enumerate(person(t))
+    }  # fmt: skip
+    marks["box"] = {**marks["0_0"], "xy": [2, 1, 1, 9, 9]}
+    options = {} if form == "names as text" else {str(i): name for i, name in enumerate(TFJS)}
+    names = ["clip.mp4"] if form == "video" else [f"f_{t:03d}.jpg" for t in T]
+    project = {
+        "project": {"data_format_version": "3.1.1"}, "config": {}, "metadata": marks,
+        "attribute": {"1": {"aname": "joint", "type": 4, "options": options}},
+        "file": {f"{n}": {"fid": n, "fname": name} for n, name in enumerate(names, 1)},
+        "view": {f"{n}": {"fid_list": [n]} for n in range(1, len(names) + 1)},
+    }  # fmt: skip
+    path = write(tmp_path / "a.json", project)
+    check(read(path, frame_rate=25.0), (3,))
+    if form == "video":
+        project["view"] = {"1": {"fid_list": [1]}, "2": {"fid_list": [1]}}
+        marks["0_1"]["vid"] = "2"
+        with pytest.raises(KeypointError, match="points of several videos"):
+            read(write(path, project), frame_rate=25.0)
+    project["view"] = {"1": {}}
+    with pytest.raises(KeypointError, match="not VIA's pictures"):
+        read(write(path, project))
+
+
+@pytest.mark.parametrize("spelt", [str, json.dumps])
+def test_tables_whose_cells_hold_all_joints(tmp_path: Path, spelt: Callable[[Any], str]) -> None:
+    """Ultralytics' CSV, by pandas or by Polars."""
+    stream = io.StringIO()
+    rows = csv.writer(stream)
+    rows.writerow(["", "frame", "name", "confidence", "box", "keypoints"])
+    for t in T:
+        for of in (person(t), other(t))[: 2 * (t != 3)]:
+            own = columns(of)["keypoints"]
+            rows.writerow([0, t, "person", 0.9, spelt({"x1": 1.0}), spelt(own)])
+    rows.writerow([0, 3, "", "", "", ""])
+    check(read(write(tmp_path / "a.csv", stream.getvalue())), (3,))
+
+
+def test_people_by_name_in_frames(tmp_path: Path) -> None:
+    frames = {f"{t + 1}": {"Ben": {"keypoints": other(t).tolist()},
+                           "Anna": {"keypoints": person(t).tolist()}} for t in T}  # fmt: skip
+    found = read(write(tmp_path / "a.json", {"frames": frames}))
+    check(found)
+    assert any("'Anna' of the file" in line for line in found.report)
+
+
+def test_arrays_of_several_cameras_are_told(tmp_path: Path) -> None:
+    stack = np.stack([person(t)[:, :2] for t in T])
+    np.save(tmp_path / "a.npy", np.stack([stack, stack + 5, stack - 5]))
+    with pytest.raises(KeypointError, match="arrays of 3 cameras with 6 frames each"):
+        read(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"info": {}, "categories": {}, "items": []}, "Datumaro's; datum convert"),
+        ({"description": "", "tags": [], "size": {}, "objects": []}, "Supervisely's; export"),
+        ([{"version": 0, "tags": [], "shapes": [], "tracks": []}], "CVAT's backup of a task"),
+        ({"version": "2.0", "item": {}, "annotations": []}, "V7 Darwin's"),
+        ({"bone_list": [], "frames": []}, "in space"),
+    ],
+)
+def test_formats_that_are_not_read_are_named(tmp_path: Path, content: Any, words: str) -> None:
+    with pytest.raises(KeypointError, match=words):
+        read(write(tmp_path / "a.json", content))
+    with pytest.raises(KeypointError, match=words):
+        read(write(tmp_path / "folder" / "f_0.json", content).parent)
+
+
+def test_xml_in_a_folder(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        path = write(tmp_path / "x" / f"{name}.xml", "<annotation><object/></annotation>")
+        with pytest.raises(KeypointError, match="LabelMe on the web or Pascal VOC"):
+            read(path.parent)
+    images = "".join(
+        f'<image id="{t}" name="f_{t}.png" width="640" height="480"><skeleton label="person">'
+        + "".join(f'<points label="{n}" points="{x},{y}"/>'
+                  for n, (x, y, _) in zip(TFJS, person(t), strict=True))
+        + "</skeleton></image>"
+        for t in T
+    )  # fmt: skip
+    path = write(tmp_path / "cvat" / "annotations.xml", f"<annotations>{images}</annotations>")
+    check(read(path.parent))

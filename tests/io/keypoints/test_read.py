@@ -471,7 +471,7 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     with pytest.raises(KeypointError, match="no such file"):
         read(tmp_path / "none.npz")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(KeypointError, match="no JSON files"):
+    with pytest.raises(KeypointError, match="no keypoints in this folder"):
         read(tmp_path / "folder")
     (tmp_path / "a.npz").write_text("{}")
     with pytest.raises(KeypointError, match="not an NPZ file"):

@@ -65,9 +65,9 @@ def bad(path: Path, line: int, expected: str, found: object) -> MotionCaptureErr
 
 
 def finite_numbers(path: Path, line: int, words: Sequence[str], expected: str) -> list[float]:
-    """Finite numbers, as any program writes them (float() takes 1_000, too)."""
+    """Finite numbers, as any program writes them: with a decimal comma, but not as 1_000."""
     try:
-        values = [math.nan if "_" in word else float(word) for word in words]
+        values = [math.nan if "_" in word else float(word.replace(",", ".")) for word in words]
     except ValueError:
         values = [math.nan]
     if not all(abs(value) < _HUGE for value in values):
@@ -222,7 +222,7 @@ def _bvh_frames(
         raise bad(path, lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
     first, second, rows = lines[1], lines[2], lines[3:]
     number = whole_number(path, first.number, _said(path, first, "Frames"), "a number of frames")
-    digits = _said(path, second, "Frame Time")
+    digits = _said(path, second, "Frame Time").replace(",", ".")
     (interval,) = finite_numbers(path, second.number, [digits], "the seconds of a frame")
     if not 1e-6 < interval < 1e3:
         raise bad(path, second.number, "the seconds of a frame", digits)

@@ -52,6 +52,9 @@ _THINNEST = 0.001
 _LARGEST = 10.0
 """A link's half side that is none: such as of a mesh in millimetres, metres."""
 
+_MOST_TURN = 20.0
+"""Radians, or metres, between the limits of a joint: more are degrees, or millimetres."""
+
 _ROUNDED = (0.5, 1.0, 0.0, 0.0, 0.0, 0.0)
 """What a part in a box has beside its half sides: a section that is round, ends that are nearly
 flat."""
@@ -91,6 +94,10 @@ def read_urdf(
                 "free"
             )
     joints = _tree(root, elements)
+    if wide := [each.name for each in joints if _MOST_TURN < each.upper - each.lower < math.inf]:
+        notes.append(
+            f"joints whose limits are far apart, {shortened(wide)}: they are radians and metres"
+        )
     links = {link.get("name", "") for link in robot.findall("link")}
     if beside := links - {joint.link for joint in joints}:
         raise BodyError(f"the links {sorted(beside)} form a loop")

@@ -1,9 +1,10 @@
 """Joints that somebody marked as points of pictures, in labelme, VIA or Label Studio.
 
-*labelme.* `shapes` of a picture; `group_id` says of whom a point is. *VIA*, to version 2, JSON or
-CSV. `regions` of every picture; what an attribute is called is the annotator's choice, and the one
-with most names of joints is the joint's. *Label Studio.* Tasks with `annotations`, or its short
-JSON; percent of the picture; people are the boxes that points hang on.
+*labelme.* `shapes` of a picture; `group_id` says of whom a point is. *VIA*, JSON or CSV. `regions`
+of every picture, from version 3 on `metadata` of pictures or times of a video; what an attribute is
+called is the annotator's choice, and the one with most names of joints is the joint's. *Label
+Studio.* Tasks with `annotations`, or its short JSON; percent of the picture; people are the boxes
+that points hang on.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ Point = tuple[str | None, str, Sequence[float]]
 """Of whom a point is, which joint, and u, v and maybe confidence. None is the only one; who begins
 with # may be another one in the next picture."""
 
-Regions = dict[str, list[tuple[Any, ...]]]
-"""Shape and attributes of every region, by picture."""
+Regions = dict[Key, list[tuple[Any, ...]]]
+"""Shape and attributes of every region, by picture or time."""
 
 _MARK = ("x", "y", "original_width", "original_height")
 """What is known of a point in Label Studio: percent of the picture, and its size."""
@@ -76,6 +77,8 @@ def labelme_people(where: str, shapes: object) -> list[Person]:
 
 def is_via(content: Mapping[str, Any]) -> bool:
     """Whether JSON is a project or the annotations of VIA."""
+    if {"metadata", "attribute", "view", "file"} <= content.keys():
+        return True
     pictures = content.get("_via_img_metadata", content)
     return isinstance(pictures, dict) and any(
         isinstance(each, dict) and {"filename", "regions"} <= each.keys()
@@ -87,6 +90,8 @@ def read_via(content: Mapping[str, Any]) -> People:
     """Read VIA's JSON."""
     found: Regions = {}
     with refusing(KeypointError, "not VIA's pictures"):
+        if "metadata" in content:
+            return _via_people(_of_version_3(content))
         for each in content.get("_via_img_metadata", content).values():
             regions = each["regions"]
             regions = regions.values() if isinstance(regions, dict) else regions  # of version 1
@@ -94,6 +99,28 @@ def read_via(content: Mapping[str, Any]) -> People:
                 (region["shape_attributes"], region["region_attributes"]) for region in regions
             ]
     return _via_people(found)
+
+
+def _of_version_3(content: Mapping[str, Any]) -> Regions:
+    """The regions of a project of version 3, as those before it have them."""
+    names = {
+        view: content["file"][f"{shown['fid_list'][0]}"]["fname"]
+        for view, shown in content["view"].items()
+    }
+    marks = [*content["metadata"].values()]
+    found: Regions = {} if any(mark["z"] for mark in marks) else {n: [] for n in names.values()}
+    if not found and len({mark["vid"] for mark in marks}) > 1:
+        raise KeypointError("points of several videos; give a project of one")
+    for mark in marks:
+        about = {}
+        for key, value in mark["av"].items():
+            attribute = content["attribute"][key]
+            about[attribute["aname"]] = (attribute.get("options") or {}).get(value, value)
+        if mark["xy"] and mark["xy"][0] == 1:  # a point
+            shape = {"name": "point", "cx": mark["xy"][1], "cy": mark["xy"][2]}
+            key = float(mark["z"][0]) if mark["z"] else names[f"{mark['vid']}"]
+            found.setdefault(key, []).append((shape, about))
+    return found
 
 
 def read_via_table(heading: Sequence[str], rows: Iterable[tuple[int, Sequence[str]]]) -> People:
@@ -110,7 +137,7 @@ def read_via_table(heading: Sequence[str], rows: Iterable[tuple[int, Sequence[st
 def _via_people(found: Regions) -> People:
     """People of the points of pictures, each with its attributes."""
     values: dict[str, set[str]] = {}
-    marks: dict[str, list[tuple[dict[str, str], Sequence[float]]]] = {}
+    marks: dict[Key, list[tuple[dict[str, str], Sequence[float]]]] = {}
     with refusing(KeypointError, "not VIA's regions"):
         for name, regions in found.items():
             marks[name] = [
@@ -124,7 +151,8 @@ def _via_people(found: Regions) -> People:
     joint = max(values, key=lambda key: (known[key], len(values[key])), default="")
     frames: Frames = {
         name: people_of_points(
-            name, [(track_of({**about, joint: ""}), about.get(joint, ""), uv) for about, uv in own]
+            f"{name}",
+            [(track_of({**about, joint: ""}), about.get(joint, ""), uv) for about, uv in own],
         )
         for name, own in marks.items()
     }

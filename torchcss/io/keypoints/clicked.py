@@ -21,12 +21,14 @@ def is_clicked(content: Mapping[str, Any]) -> bool:
         return True
     frames = content.get("frames")
     detected = {*PEOPLE, *JOINTS} - {"joints"}
-    return isinstance(frames, dict) and not any(
-        each.keys() & detected
-        if isinstance(each, dict)
-        else isinstance(each, list) and bool(each) and isinstance(each[0], (dict, list))
-        for each in frames.values()
-    )
+    if not isinstance(frames, dict):
+        return False
+    if any(isinstance(each, list) and isinstance((each or [0])[0], (dict, list))
+           for each in frames.values()):  # fmt: skip
+        return False
+    named = [each for each in frames.values() if isinstance(each, dict)]
+    inner = [one for each in named for one in each.values() if isinstance(one, dict)]
+    return not any(each.keys() & detected for each in (*named, *inner))
 
 
 def read_clicked(content: Mapping[str, Any], image_size_wh: Size) -> People:

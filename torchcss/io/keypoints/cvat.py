@@ -31,6 +31,11 @@ def read_cvat(path: Path) -> People:
         KeypointError: If it is another XML, or a point is none.
     """
     root = parse_xml(path, "CVAT's XML", KeypointError)
+    if root.tag == "annotation":
+        raise KeypointError(
+            "a picture's XML, of LabelMe on the web or Pascal VOC; expected CVAT's, labelme's JSON "
+            "or COCO's"
+        )
     if root.tag != "annotations":
         raise KeypointError(f"expected CVAT's annotations, found <{root.tag}>")
     pictures = [*root.iter("image")]

@@ -52,7 +52,15 @@ from torchcss.io.keypoints.people import (
     united,
 )
 from torchcss.io.keypoints.tables import people_of_rows, rows_of_json
-from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, PICTURES, TIMES, first_of, time_word
+from torchcss.io.keypoints.words import (
+    FRAMES,
+    ORDER_NAMES,
+    PICTURES,
+    TIMES,
+    first_of,
+    seconds_in,
+    time_word,
+)
 from torchcss.io.video import natural_order
 
 _FORMATS = {
@@ -62,6 +70,18 @@ _FORMATS = {
     "keypoint_scores": "MMPose", "image_id": "COCO", "position": "PoseNet",
 }  # fmt: skip
 """Whose a file is, by a word in it."""
+
+_OTHERS = {
+    "categories items": "Datumaro's; datum convert -if datumaro -f coco_person_keypoints -i FOLDER "
+    "makes COCO's of it",
+    "objects tags size": "Supervisely's; export the project as COCO keypoints",
+    "shapes tracks tags": "CVAT's backup of a task; export the task as 'CVAT for video 1.1' or "
+    "'COCO Keypoints 1.0'",
+    "annotations item": "V7 Darwin's; export the dataset as COCO",
+    "data_row projects": "Labelbox's; convert it to COCO",
+    "bone_list frames": "Azure Kinect's joints in space; expected pixels",
+}
+"""Files of other kinds by words in them, and what to do."""
 
 _HUGE = 1e17
 """No number of a frame is so large, nor a time, were it in microseconds since 1970."""
@@ -80,7 +100,11 @@ def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People
     Raises:
         KeypointError: If it is none of the formats; the message says where.
     """
-    content = _load(path)
+    return read_content(path, _load(path), image_size_wh, num_frames)
+
+
+def read_content(path: Path, content: Any, image_size_wh: Size, num_frames: int | None) -> People:
+    """The same of what a file of JSON holds."""
     if (array := _plain_array(content)) is not None and is_movenet(array):
         return read_arrays(path, {path.name: array})
     if annotated.is_label_studio(content):
@@ -161,6 +185,10 @@ def _load(path: Path) -> Any:
     """The content of a JSON file, or of one object in every line or text."""
     try:
         content = load_json(path, KeypointError)
+        first = content[0] if isinstance(content, list) and content else content
+        for words, what in _OTHERS.items():
+            if isinstance(first, dict) and {*words.split()} <= first.keys():
+                raise KeypointError(f"{path}: {what}")
         if not isinstance(content, list) or not all(isinstance(each, str) for each in content):
             return content
         lines = content
@@ -244,6 +272,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
             )
         found.setdefault(key, []).extend(people_of(f"{path}: {key!r}", entry, alone=True))
     time = time_word(content[0]) if all(isinstance(key, float) for key in found) else None
+    if isinstance(first_of(content[0], (time or "",)), str):
+        time = "seconds"
     return found if time is None else in_seconds(time, found)
 
 
@@ -282,7 +312,8 @@ def _key_of(where: str, entry: object) -> Key | None:
     counted = first_of({k: v for k, v in texts.items() if re.fullmatch("[0-9]{1,9}", v)}, FRAMES)
     if counted is not None:
         return int(counted)
-    time = first_of(counts, tuple(TIMES))
+    codes = {k: code for k, text in texts.items() if (code := seconds_in(text)) is not None}
+    time = first_of({**counts, **codes}, tuple(TIMES))
     return float(time) if time is not None else first_of(texts, PICTURES)
 
 

@@ -54,13 +54,13 @@ from torchcss.io.keypoints.findings import findings
 from torchcss.io.keypoints.frames import Film, files_of, in_order, wrong_count
 from torchcss.io.keypoints.h36m import is_h36m, read_h36m
 from torchcss.io.keypoints.hdf5 import read_hdf5
-from torchcss.io.keypoints.json_files import read_folder, read_json
+from torchcss.io.keypoints.json_files import read_content, read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
 from torchcss.io.keypoints.links import Links, joints_named, names_links
 from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.sides import with_sides_put_back
-from torchcss.io.keypoints.tables import read_table
+from torchcss.io.keypoints.tables import json_of_rows, people_of_rows, table_rows
 from torchcss.joint_names import (
     ALIASES,
     JOINT_NAMES,
@@ -102,6 +102,9 @@ _NORMALISED_EXTENT = 2.0
 
 _LARGEST_FRACTION = 3.0
 """Landmarks that MediaPipe guesses outside the image stay within this many of its sides."""
+
+_PERCENT = 50.0
+"""Confidences that run to more than this, and to 100 at most, are percent."""
 
 _OUTSIDE = 3.0
 """How many times the longer image side a joint may lie outside before the file is refused."""
@@ -243,9 +246,9 @@ def _stacked(frames: Sequence[Sequence[Person]]) -> list[np.ndarray]:
 # The formats.
 
 
-def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
+def _read(path: Path, size: Size, num: int | None) -> People:
     if path.is_dir():
-        return _read_folder(path, image_size_wh, num_frames)
+        return _read_folder(path, size, num)
     archive, mark, selection = str(path).rpartition("#")
     if mark and not path.exists():
         path = Path(archive)
@@ -266,7 +269,9 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
     if suffix in (".csv", ".tsv") or (
         suffix == ".txt" and read_text(path, KeypointError).lstrip()[:1] not in ("{", "[")
     ):
-        return read_table(path)
+        rows = table_rows(path)
+        inner = json_of_rows(rows)
+        return people_of_rows(rows) if inner is None else read_content(path, inner, size, num)
     if suffix in (".h5", ".hdf5", ".slp"):
         return read_hdf5(path)
     if suffix == ".xml":
@@ -274,23 +279,27 @@ def _read(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
     for suffixes, what in _OTHERS.items():
         if suffix in suffixes.split() and path.is_file():
             raise KeypointError(what)
-    return read_json(path, image_size_wh, num_frames)
+    return read_json(path, size, num)
 
 
-def _read_folder(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
+def _read_folder(path: Path, size: Size, num: int | None) -> People:
     """A file for every frame, or one without a number; or one camera's folder of them."""
     if files := files_of(path, ".json"):
         if len(files) == 1 and not re.search("[0-9]", files[0].stem):
-            return read_json(files[0], image_size_wh, num_frames)
+            return read_json(files[0], size, num)
         return read_folder(path)
     if files_of(path, ".txt"):
-        return read_labels(path, image_size_wh)
+        return read_labels(path, size)
+    if files := files_of(path, ".xml"):
+        people = read_cvat(files[0])
+        if len(files) == 1:
+            return people
     folders = sorted(entry.name for entry in path.iterdir() if entry.is_dir())
     if len(folders) == 1:
-        return _read_folder(path / folders[0], image_size_wh, num_frames)
+        return _read_folder(path / folders[0], size, num)
     raise KeypointError(
-        "no JSON files in this folder; expected OpenPose's, EasyMocap's or YOLO's labels, "
-        "one for every frame"
+        "no keypoints in this folder; expected OpenPose's, EasyMocap's or YOLO's labels, one for "
+        "every frame, or one file of another format"
         + (f"; give one of {shortened(', '.join(folders))}" if folders else "")
     )
 
@@ -303,6 +312,11 @@ def _check_counts(
 ) -> None:
     """Refuse another number of frames than the video's, and of names than joints."""
     if film.num_frames is not None and len(frames) != film.num_frames:
+        if {len(frame) for frame in frames} == {film.num_frames}:
+            raise KeypointError(
+                f"arrays of {len(frames)} cameras with {film.num_frames} frames each, it seems; "
+                "save those of this camera alone"
+            )
         raise wrong_count(film.num_frames, len(frames))
     if not 0 <= first_frame < max(1, len(frames)):
         raise KeypointError(
@@ -322,6 +336,11 @@ def _checked_numbers(
 ) -> list[np.ndarray]:
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
     checked, clipped = [], 0
+    counts = np.concatenate([np.zeros(0), *(frame[..., 2].ravel() for frame in frames)])
+    most = float(np.max(counts, initial=0.0, where=np.isfinite(counts)))
+    if _PERCENT < most <= 100.0 and not (counts < 0.0).any():
+        report.append(f"confidences run to {most:g}: they are taken for percent")
+        frames = [frame * (1.0, 1.0, 0.01) for frame in frames]
     for index, frame in enumerate(frames):
         # All three not a number is how some programs write a joint that they did not find.
         frame = np.where(np.isnan(frame).all(-1, keepdims=True), 0.0, frame)

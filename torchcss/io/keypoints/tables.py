@@ -10,6 +10,8 @@ their times; another one says who it is (SLEAP's `track`).
 
 *Long.* One row for every joint of every frame: `frame, landmark, x, y, visibility`.
 
+*In a cell.* One row for every person, whose joints a cell holds as JSON (`json_of_rows`).
+
 Joints that are only numbered are MediaPipe's if there are 33. Each of the three says by its heading
 what its columns are (`_Columns`); the rows are then read alike.
 """
@@ -19,6 +21,7 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -33,6 +36,7 @@ from torchcss.files import read_text, refusing, shortened, unexpected
 from torchcss.io.keypoints import words
 from torchcss.io.keypoints.annotated import VIA_SHAPE, read_via_table
 from torchcss.io.keypoints.frames import in_seconds
+from torchcss.io.keypoints.json_people import JOINTS
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import Frames, Key, People, Person, joint_counts, screened
 from torchcss.joint_names import CASE, names_in
@@ -81,20 +85,11 @@ class _Columns(NamedTuple):
     time: str | None = None
 
 
-def read_table(path: Path) -> People:
-    """Read a CSV.
-
-    Raises:
-        KeypointError: If it is none of those above; the message names the row.
-    """
-    return people_of_rows(table_rows(path))
-
-
 def people_of_rows(rows: list[Row]) -> People:
     """The people of a table's rows, the first of which is its heading.
 
     Raises:
-        KeypointError: As `read_table`.
+        KeypointError: If it is none of those above; the message names the row.
     """
     firsts = [row[0].lower() for _, row in rows[:4]]
     if "bodyparts" in firsts and "coords" in firsts:
@@ -108,6 +103,12 @@ def people_of_rows(rows: list[Row]) -> People:
     if VIA_SHAPE in heading:
         return read_via_table(heading, rows[1:])
     columns = _headed(heading)
+    if columns.time is not None and columns.frame is not None:
+        first = rows[1][1][columns.frame : columns.frame + 1]
+        if first and words.seconds_in(first[0]) is not None:
+            columns = columns._replace(time="seconds")
+        elif first and ":" in first[0]:  # it counts frames in a second
+            columns = columns._replace(frame=None, time=None)
     said = [n for n in (columns.frame, columns.track) if n is not None]
     who = {tuple("".join(row[n : n + 1]) for n in said) for _, row in rows[1:]}
     if not said and columns.joint is None and _counts(rows):
@@ -166,6 +167,25 @@ def rows_of_json(content: object) -> list[Row] | None:
         return None
     rows = [["" if cell is None else f"{cell}" for cell in row] for row in content]
     return [*enumerate([[_head(each) for each in heading], *rows], start=1)]
+
+
+def json_of_rows(rows: Sequence[Row]) -> list[dict[str, Any]] | None:
+    """The same rows as objects, if a cell holds all joints (Ultralytics); None: none does."""
+    (_, heading), *body = rows
+    column = next((n for n, cell in enumerate(heading) if words.plain_word(cell) in JOINTS), None)
+    if column is None or not body:
+        return None
+    if not all("".join(row[column : column + 1])[:1] in ("", "[", "{") for _, row in body):
+        return None
+    return [dict(zip(heading, map(_value, row), strict=False)) for _, row in body]
+
+
+def _value(cell: str) -> Any:
+    """What a cell holds in JSON, or in Python's like of it, or else its text."""
+    text = re.sub(r"\bnan\b", "NaN", cell.replace("'", '"').replace("None", "null")) or "null"
+    with suppress(ValueError, RecursionError):
+        return json.loads(text)
+    return cell
 
 
 def _head(head: object) -> str:
@@ -395,7 +415,8 @@ def _place(where: str, columns: _Columns, cells: Sequence[str], index: int) -> K
         return index if columns.joint is None else 0
     cell = cells[columns.frame]
     if columns.time is not None:
-        return _number(where, cell)
+        seconds = words.seconds_in(cell)
+        return _number(where, cell) if seconds is None else seconds
     if not re.fullmatch(r"[0-9.-]*|[0-9.]+[eE][-+]?[0-9]+", cell):
         return cell  # of labelled frames the picture's name
     with suppress(ValueError):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
 from functools import lru_cache
 from typing import TypeVar
 
@@ -25,7 +27,7 @@ TIMES: dict[str, float | None] = {
     **dict.fromkeys(("timestampms", "timems", "milliseconds"), 1e-3),
     **dict.fromkeys(("timestampus", "timeus"), 1e-6),
     **dict.fromkeys(("timestamps", "times", "timesec", "timeseconds", "seconds"), 1.0),
-    **dict.fromkeys(("timestamp", "time", "t"), None),
+    **dict.fromkeys(("timestamp", "time", "timecode", "t"), None),
 }
 """A time, and its unit in seconds, where the word says it."""
 
@@ -94,6 +96,20 @@ def time_word(words: Iterable[str]) -> str | None:
     """Which of the words is a time's, the one that says most if there are several."""
     plain = {plain_word(word) for word in words}
     return next((word for word in TIMES if word in plain), None)
+
+
+def seconds_in(text: str) -> float | None:
+    """The seconds of a time as text: `1:02:03.5`, `02:03,5`, a date with a time; None: it is none.
+
+    A time code whose last number counts frames is none.
+    """
+    if match := re.fullmatch(r"(?:([0-9]{1,4}):)?([0-9]{1,2}):([0-9]{1,2}(?:[.,][0-9]+)?)", text):
+        hours, minutes, seconds = match.groups("0")
+        return 3600.0 * int(hours) + 60 * int(minutes) + float(seconds.replace(",", "."))
+    with suppress(ValueError, OverflowError):
+        if re.match("[0-9]{4}-[0-9]{2}-[0-9]{2}[T ]", text):
+            return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
+    return None
 
 
 def track_text(value: float | str) -> str | None:
