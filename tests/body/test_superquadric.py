@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.autograd import differentiated
 from torch import Tensor
 
 from torchcss.body.superquadric import Superquadrics, radial_hessian, radial_square, unbend
 from torchcss.body.surface import implicit, surface_points
+from torchcss.types import PointCost
 
 
 def random_shapes(number: int, generator: torch.Generator, *, bent: bool) -> Tensor:
@@ -21,7 +23,7 @@ def random_shapes(number: int, generator: torch.Generator, *, bent: bool) -> Ten
     return torch.cat([*parts, uniform(-0.6, 0.6, 2), bends], dim=-1)
 
 
-def by_autograd(shape: Tensor, points: Tensor, *, bent: bool) -> tuple[Tensor, Tensor, Tensor]:
+def by_autograd(shape: Tensor, points: Tensor, *, bent: bool) -> PointCost:
     """The same with `pow` and derivatives by double backward."""
     leaf = points.clone().requires_grad_()
     rows = Superquadrics.of(shape)
@@ -33,9 +35,7 @@ def by_autograd(shape: Tensor, points: Tensor, *, bent: bool) -> tuple[Tensor, T
     x, y = x / (1 + shape[:, 5] * height), y / (1 + shape[:, 6] * height)
     section = (x / a1).abs() ** (2 / e2) + (y / a2).abs() ** (2 / e2)
     value = (section ** (e2 / e1) + (z / a3).abs() ** (2 / e1)) ** e1
-    (slope,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
-    hessian = [torch.autograd.grad(slope[:, i].sum(), leaf, retain_graph=True)[0] for i in range(3)]
-    return value.detach(), slope.detach(), torch.stack(hessian, dim=-2)
+    return differentiated(value, leaf)
 
 
 @pytest.mark.parametrize("bent", [False, True])

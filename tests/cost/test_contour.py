@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.camera import jacobian_of
+from reference.autograd import differentiated
+from reference.camera import jacobian_of, skew_camera
 from reference.contour import cost_of_fixed_matches, edges_along_lines
 from torch import Tensor
 
@@ -16,7 +17,6 @@ from torchcss.cost import contour
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc, Quadratic
-from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 
 WIDTH, HEIGHT = 128, 96
@@ -30,16 +30,8 @@ PRINTED = {
 
 
 def make_camera(distortion: list[float] | None = None) -> Camera:
-    rotation = torch.linalg.matrix_exp(
-        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]], dtype=torch.float64)
-    )
-    return Camera(
-        [[120.0, 0.0, 61.0], [0.0, 118.0, 47.0], [0.0, 0.0, 1.0]],
-        (WIDTH, HEIGHT),
-        distortion=distortion,
-        R_camera_world=rotation,
-        t_camera_world=[0.1, -0.2, 2.0],
-    )
+    size = WIDTH, HEIGHT
+    return skew_camera((120.0, 118.0), (61.0, 47.0), size, away=2.0, distortion=distortion)
 
 
 def ridges(*ridge: tuple[float, float, float]) -> Tensor:
@@ -115,11 +107,7 @@ def test_derivatives_are_those_of_fixed_matches(
     found = term.search(model.uv, normal, field)
     points = nodes.points.clone().requires_grad_()
     value = cost_of_fixed_matches(term, nodes, camera, found, model.uv, normal, points)
-    (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=True)
-    rows = [
-        torch.autograd.grad(gradient[..., a].sum(), points, retain_graph=True)[0] for a in range(3)
-    ]
-    expected = PointCost(value.detach(), gradient.detach(), torch.stack(rows, dim=-2))
+    expected = differentiated(value, points)
     assert expected.gradient.any()
     for ours, theirs in zip(got, expected, strict=True):
         scale = float(theirs.abs().max())

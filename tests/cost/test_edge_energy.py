@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 import torch
-from reference.camera import jacobian_of
+from reference.autograd import differentiated
+from reference.camera import jacobian_of, skew_camera
 from reference.spline import spline
 from torch import Tensor
 
 from torchcss.cost.edge_energy import EdgeEnergyTerm, SplineField, edge_energy_field
 from torchcss.cost.visibility import SeenNodes
 from torchcss.robust import Leclerc, Lorentzian
-from torchcss.types import PointCost
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
@@ -20,16 +20,7 @@ DISTORTION = [-0.33, 0.046, -0.0043, 0.0041, 0.067]
 
 
 def make_camera(distortion: list[float] | None = None) -> Camera:
-    rotation = torch.linalg.matrix_exp(
-        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]], dtype=torch.float64)
-    )
-    return Camera(
-        [[50.0, 0.0, 19.0], [0.0, 48.0, 15.0], [0.0, 0.0, 1.0]],
-        (WIDTH, HEIGHT),
-        distortion=distortion,
-        R_camera_world=rotation,
-        t_camera_world=[0.1, -0.2, 3.0],
-    )
+    return skew_camera((50.0, 48.0), (19.0, 15.0), (WIDTH, HEIGHT), distortion=distortion)
 
 
 def random_edges(generator: torch.Generator, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
@@ -52,16 +43,6 @@ def random_nodes(*batch: int, generator: torch.Generator, count: int = 30) -> Se
     )
 
 
-def second_derivatives(value: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradient and Hessian per point of independent values."""
-    (gradient,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
-    rows = [
-        torch.autograd.grad(gradient[..., a].sum(), leaf, retain_graph=True)[0]
-        for a in range(leaf.shape[-1])
-    ]
-    return gradient.detach(), torch.stack(rows, dim=-2)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (2, 2), (9, 14)])
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
 def test_the_field_is_the_spline_of_its_twin(
@@ -77,12 +58,12 @@ def test_the_field_is_the_spline_of_its_twin(
     inner = field.coefficients[0, 4:-4, 4:-4]
     assert inner.shape == size
     expected = spline(inner, uv)
-    gradient, hessian = second_derivatives(expected, uv)
+    _, gradient, hessian = differentiated(expected, uv)
     got = field.sample(uv.detach())
     for ours, theirs in zip(got, (expected.detach(), gradient, hessian), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0.0, atol=1e-12)
     torch.testing.assert_close(field.value(uv.detach()), got.value, rtol=0.0, atol=0.0)
-    own = second_derivatives(field.value(uv), uv)
+    own = differentiated(field.value(uv), uv)[1:]
     torch.testing.assert_close(got.gradient, own[0], rtol=0.0, atol=1e-12)
     torch.testing.assert_close(got.hessian, own[1], rtol=0.0, atol=1e-12)
 
@@ -128,7 +109,7 @@ def test_derivatives_per_point_are_those_of_autograd(
     got = term.point_cost(nodes, camera, field)
     leaf = nodes.points.clone().requires_grad_()
     value = term.value(nodes._replace(points=leaf), camera, field)
-    expected = PointCost(value.detach(), *second_derivatives(value, leaf))
+    expected = differentiated(value, leaf)
     assert int((expected.gradient != 0).any(-1).sum()) > 0
     for ours, theirs in zip(got, expected, strict=True):
         scale = float(theirs.abs().max())
@@ -144,7 +125,7 @@ def test_gauss_newton_leaves_out_the_curvature_of_the_projection(
     model = camera.project_with_derivatives(nodes.points)
     leaf = model.uv.clone().requires_grad_()
     value = 0.5 * term.potential(1 - field.value(leaf)).rho * nodes.exists * nodes.visible
-    _, bowl = second_derivatives(value, leaf)
+    bowl = differentiated(value, leaf).hessian
     got = term.point_cost(nodes, camera, field, gauss_newton=True)
     jacobian = jacobian_of(camera, model)
     torch.testing.assert_close(got.hessian, jacobian.mT @ bowl @ jacobian)

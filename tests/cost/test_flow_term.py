@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from reference import flow_residual as reference
+from reference.autograd import differentiated
 from reference.camera import jacobian_of
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from torchcss.cost.visibility import SeenNodes, facing_nodes
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.robust import Leclerc, Lorentzian
 from torchcss.studies.render.sequences import arm_sequence
-from torchcss.types import Curvature, PointCost
+from torchcss.types import Curvature
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING_FLOW
@@ -162,11 +163,7 @@ def test_derivatives_per_point_are_those_of_autograd(
     got = term.point_cost(seen(points, normals, visible, camera), camera, targets)
     leaf = points.clone().requires_grad_()
     value = term.value(seen(leaf, normals, visible, camera), camera, targets)
-    (gradient,) = torch.autograd.grad(value.sum(), leaf, create_graph=True)
-    rows = [
-        torch.autograd.grad(gradient[..., a].sum(), leaf, retain_graph=True)[0] for a in range(3)
-    ]
-    expected = PointCost(value.detach(), gradient.detach(), torch.stack(rows, dim=-2))
+    expected = differentiated(value, leaf)
     assert int((expected.gradient != 0).any(-1).sum()) > 0
     for ours, theirs in zip(got, expected, strict=True):
         scale = float(theirs.abs().max())
@@ -182,9 +179,7 @@ def test_gauss_newton_leaves_out_the_curvature_of_the_projection(
     model = camera.project_with_derivatives(points)
     error = (model.uv - targets.uv).requires_grad_()
     rho = term.potential(targets.weight * error.square().sum(-1)).rho
-    (slope,) = torch.autograd.grad(0.5 * rho.sum(), error, create_graph=True)
-    rows = [torch.autograd.grad(slope[:, a].sum(), error, retain_graph=True)[0] for a in range(2)]
-    bowl = torch.stack(rows, dim=-2)
+    bowl = differentiated(0.5 * rho, error).hessian
     normals = camera.centre_world - points
     got = term.point_cost(seen(points, normals, one, camera), camera, targets, gauss_newton=True)
     jacobian = jacobian_of(camera, model)

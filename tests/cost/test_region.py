@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.autograd import differentiated
 from torch import Tensor
 from torch.nn import functional
 
@@ -94,15 +95,10 @@ def test_derivatives_per_point_are_those_of_autograd(
     got = term.point_cost(nodes, camera, images)
     points = nodes.points.clone().requires_grad_()
     value = frozen_value(term, nodes, camera, images, points)
-    (gradient,) = torch.autograd.grad(value.sum(), points, create_graph=True)
-    rows = [
-        torch.autograd.grad(gradient[..., a].sum(), points, retain_graph=True)[0] for a in range(3)
-    ]
     valid = camera.project(nodes.points).valid[..., None]
+    value, gradient, hessian = differentiated(value, points)
     expected = PointCost(
-        value.detach(),
-        torch.where(valid, gradient.detach(), 0.0),
-        torch.where(valid[..., None], torch.stack(rows, dim=-2), 0.0),
+        value, torch.where(valid, gradient, 0.0), torch.where(valid[..., None], hessian, 0.0)
     )
     for ours, theirs in zip(got, expected, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-9)

@@ -14,3 +14,26 @@ def jacobian_of(camera: Camera, model: ProjectionModel) -> Tensor:
     slopes = torch.eye(2).to(model.uv).expand(*model.uv.shape[:-1], 2, 2).unbind(-2)
     rows = [camera.pull_back(model, model.depth, slope, hessian).gradient for slope in slopes]
     return torch.stack(rows, dim=-2)
+
+
+def skew_camera(
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    image_size_wh: tuple[int, int],
+    *,
+    away: float = 3.0,
+    distortion: list[float] | None = None,
+    name: str = "test",
+) -> Camera:
+    """A camera that stands askew, the world's origin some metres before it."""
+    rotation = torch.linalg.matrix_exp(
+        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]], dtype=torch.float64)
+    )
+    return Camera(
+        [[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]],
+        image_size_wh,
+        distortion=distortion,
+        R_camera_world=rotation,
+        t_camera_world=[0.1, -0.2, away],
+        name=name,
+    )

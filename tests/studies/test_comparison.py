@@ -62,17 +62,23 @@ def test_together_is_as_alone(sequence: RecordedSequence, begin: Start) -> None:
     assert both[0].measures[-1].overlap > 0.8
 
 
-def test_each_tracker_looks_where_its_own_body_can_be(
-    sequence: RecordedSequence, begin: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    windows = []
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> list[Window | None]:
+    """Where features are looked for from now on."""
+    found = []
     forward = FeatureExtractor.forward
 
     def spy(self: FeatureExtractor, *arguments: Any, window: Window | None) -> FrameFeatures:
-        windows.append(window)
+        found.append(window)
         return forward(self, *arguments, window=window)
 
     monkeypatch.setattr(FeatureExtractor, "forward", spy)
+    return found
+
+
+def test_each_tracker_looks_where_its_own_body_can_be(
+    sequence: RecordedSequence, begin: Start, windows: list[Window | None]
+) -> None:
     together(sequence, begin, "css", "rr_multiple_hypothesis", stop=T)
     assert len(windows) == 2 * T
     assert None not in windows
@@ -80,18 +86,11 @@ def test_each_tracker_looks_where_its_own_body_can_be(
 
 
 def test_trackers_that_look_everywhere_share_what_they_see(
-    sequence: RecordedSequence, begin: Start, monkeypatch: pytest.MonkeyPatch
+    sequence: RecordedSequence, begin: Start, windows: list[Window | None]
 ) -> None:
     presets = ("ijrr_single_limits", "ijrr_gaussian_single")
     alone = [together(sequence, begin, preset, stop=T)[0] for preset in presets]
-    windows = []
-    forward = FeatureExtractor.forward
-
-    def spy(self: FeatureExtractor, *arguments: Any, window: Window | None) -> FrameFeatures:
-        windows.append(window)
-        return forward(self, *arguments, window=window)
-
-    monkeypatch.setattr(FeatureExtractor, "forward", spy)
+    windows.clear()
     both = together(sequence, begin, *presets, stop=T)
     assert windows == [None] * T
     for one, two in zip(both, alone, strict=True):

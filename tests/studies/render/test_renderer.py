@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -314,15 +315,7 @@ def test_shading_follows_lambert_and_blinn():
     expected = 0.5 * (0.1 + 0.8 * tilt.cos().clamp_min(0))
     torch.testing.assert_close(seen[:, 0], expected)
     # The eye is where the lamp is: the highlight is the full one for a surface that faces both.
-    shiny = Lighting(
-        lamp_world=(0, 0, 2),
-        target_world=(0, 0, 0),
-        lamp=0.8,
-        ambient=0.1,
-        upward=0.0,
-        specular=0.3,
-    )
-    glow = shiny.shade(point, normal, albedo, EYE) - seen
+    glow = replace(light, specular=0.3).shade(point, normal, albedo, EYE) - seen
     torch.testing.assert_close(glow[0, 0].item(), 0.8 * 0.3)
     assert (glow[:, 0].diff() <= 0).all()
     assert glow[3, 0] == 0
