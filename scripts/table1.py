@@ -21,12 +21,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import tyro
 from common import Table, start, write_report
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -97,20 +98,9 @@ class Config:
     """How many seeds from there; with several, the medians are printed."""
     pose: Path | None = None
     """JSON of parameter names and values: this pose instead of one drawn from plausible ones."""
-    pixel_noise: float = 3.0
-    """Noise of the image joints, pixels."""
-    prior_scale: float = 1.0
-    """Factor on the stabilisers' deviations of the package, which make a tracker's priors."""
-    widest: float | None = None
-    """Largest deviation of a parameter of the start mode; None: a quarter of its range."""
-    all_joints: bool = False
-    """All joint centres but those of face and foot are seen, not only 15 of trunk and limbs."""
-    limits: bool = True
-    """Joint limits hold."""
+    choice: Annotated[StudyChoice, tyro.conf.arg(name="")] = field(default_factory=StudyChoice)
     correlated_projection: bool = False
     """Samples return to the limits along their covariance instead of each parameter for itself."""
-    robust: bool = False
-    """Lorentzian instead of quadratic reprojection error."""
     exact_steps: bool = True
     """Descents take exact Hessians throughout, which keeps them in the basin that they start in."""
     duplicate_distance: float = 1.0
@@ -136,16 +126,8 @@ def make_problem(config: Config, seed: int, body: str) -> ReprojectionProblem:
     """The problem of one seed, with its start mode."""
     given = config.pose if body == config.body else None
     pose = None if given is None else read_pose(given)
-    choice = StudyChoice(
-        pixel_noise=config.pixel_noise,
-        prior_scale=config.prior_scale,
-        widest=config.widest,
-        limits=config.limits,
-        robust=config.robust,
-        all_joints=config.all_joints,
-    )
     generator = torch.Generator().manual_seed(seed)
-    return study_problem(body, generator=generator, choice=choice, pose=pose)
+    return study_problem(body, generator=generator, choice=config.choice, pose=pose)
 
 
 def row_of(config: Config, run: SamplerRun) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Good files of a tiny clip, and the command that tracks it."""
+"""Good files of a tiny clip, the command that tracks it, and films of any images."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,24 @@ from torchcss.cli import main as cli
 from torchcss.io.video import VideoWriter
 
 
+def write_film(path: Path, images: Iterable[np.ndarray], rate: float = 25) -> Path:
+    """Write a film of images."""
+    with VideoWriter(path, rate) as film:
+        for image in images:
+            film.write(image)
+    return path
+
+
+def grey_film(path: Path, levels: Sequence[int], size_wh: tuple[int, int] = (64, 48)) -> Path:
+    """Write a film whose frames are uniform grey, one for each level."""
+    width, height = size_wh
+    return write_film(path, (np.full((height, width, 3), level, np.uint8) for level in levels))
+
+
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     """Good files of a tiny clip, for each test to spoil one of."""
-    with VideoWriter(tmp_path / "video.mp4", 25) as film:
-        for shade in (10, 20, 30):
-            film.write(np.full((48, 64, 3), shade, dtype=np.uint8))
+    grey_film(tmp_path / "video.mp4", (10, 20, 30))
     camera = {
         "image_size_wh": [64, 48],
         "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]],

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from made_clip import write_film
 
-from torchcss.io.video import VideoWriter
+from torchcss.io.cameras import calibration, camera_entry
 from torchcss.studies.evaluation import silhouette
 from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 
@@ -22,24 +23,29 @@ def rendered_arm(seed: int, num_frames: int) -> SyntheticSequence:
     return arm_sequence(generator=torch.Generator().manual_seed(seed), num_frames=num_frames)
 
 
+def write_clip(folder: Path, made: SyntheticSequence) -> Path:
+    """Write a video, its camera and exact keypoints, without noise."""
+    write_film(folder / "video.mp4", made.frames, made.frame_rate)
+    known = calibration((made.camera, "video.mp4"))
+    (folder / "cameras.json").write_text(json.dumps(known))
+    uv = made.camera.project(made.joints_world).uv.numpy()
+    np.savez(
+        folder / "keypoints.npz", keypoints=uv, confidence=np.ones(uv.shape[:2]),
+        joint_names=np.array(made.body.joint_names),
+    )  # fmt: skip
+    return folder
+
+
 def write_arm(folder: Path, num_frames: int, *, seed: int = 0) -> SyntheticSequence:
     """Render the demo's arm and write everything that a folder may hold."""
     generator = torch.Generator().manual_seed(seed)
     made = arm_sequence(generator=generator, num_frames=num_frames)
     folder.mkdir(parents=True, exist_ok=True)
-    with VideoWriter(folder / "video.mp4", made.frame_rate) as film:
-        for image in made.frames:
-            film.write(image)
+    write_film(folder / "video.mp4", made.frames, made.frame_rate)
     camera, body = made.camera, made.body
-    entry = {
-        "video": "video.mp4",
-        "image_size_wh": list(camera.image_size_wh),
-        "K": camera.K.tolist(),
-        "R": camera.R_camera_world.tolist(),
-        "t": camera.t_camera_world.tolist(),
-    }
-    calibration = {"units": "metre, pixel", "cameras": {"cam01": entry}}
-    (folder / "cameras.json").write_text(json.dumps(calibration))
+    entry = {"video": "video.mp4", **camera_entry(camera)}
+    known = {"units": "metre, pixel", "cameras": {"cam01": entry}}
+    (folder / "cameras.json").write_text(json.dumps(known))
     joints = made.joints_world
     exact = camera.project(joints).uv
     inside = camera.inside_image(exact).numpy()

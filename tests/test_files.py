@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
+from made_clip import grey_film
 from made_tracks import export_as, make_track
 from matplotlib.figure import Figure
 
@@ -25,7 +25,7 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.tracks import FrameModes, Track, TrackWriter, load_track, save_track, write_summary
-from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.io.video import VideoReader
 from torchcss.show.click import write_clicked
 from torchcss.show.style import save_figure
 from torchcss.studies.sequence_writer import write_sequence
@@ -58,9 +58,7 @@ def fitted_body(path: Path) -> None:
 
 
 def film(path: Path) -> None:
-    with VideoWriter(path, 25) as writer:
-        for value in (0, 100, 200):
-            writer.write(np.full((48, 64, 3), value, np.uint8))
+    grey_film(path, (0, 100, 200))
 
 
 def clicked(path: Path) -> None:

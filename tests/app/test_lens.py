@@ -9,6 +9,7 @@ import av
 import numpy as np
 import pytest
 import torch
+from made_clip import grey_film
 from PIL import ExifTags, Image
 
 import torchcss
@@ -16,7 +17,7 @@ from torchcss.app.lens import KnownLens
 from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError
-from torchcss.io.video import VideoWriter, focal_length_35mm
+from torchcss.io.video import focal_length_35mm
 from torchcss.studies.sequence_writer import write_camera
 
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
@@ -86,9 +87,7 @@ def test_a_camera_is_said_once() -> None:
 
 @pytest.mark.parametrize("stature", [1.9, None])
 def test_what_is_unknown_is_fitted_and_said(tmp_path: Path, stature: float | None) -> None:
-    with VideoWriter(tmp_path / "video.mp4", 25) as film:
-        for shade in (10, 20, 30, 40, 50):
-            film.write(np.full((96, 128, 3), shade, dtype=np.uint8))
+    grey_film(tmp_path / "video.mp4", (10, 20, 30, 40, 50), (128, 96))
     places = {
         "l_shoulder": (70, 30), "r_shoulder": (56, 30), "l_elbow": (76, 40), "r_elbow": (50, 40),
         "l_wrist": (74, 50), "r_wrist": (52, 50), "l_hip": (67, 52), "r_hip": (59, 52),

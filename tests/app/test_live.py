@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import io
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from made_clip import track
 from PIL import Image
 
 from torchcss.app import recorder
 from torchcss.app.recorder import Picture
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.body.load import load_body
-from torchcss.cli import main as cli
 from torchcss.io.cameras import load_camera, read_camera
 from torchcss.io.tracks import load_track, read_summary
-from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.io.video import VideoReader
 from torchcss.show.track_plots import bones_of
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
@@ -28,32 +27,13 @@ SETTINGS = Settings(body="arm7", samples=3, modes=2, terms=("joints",))
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> Path:
-    """A clip without content, and marks that move."""
-    with VideoWriter(tmp_path / "video.mp4", 25) as film:
-        for shade in (10, 20, 30):
-            film.write(np.full((48, 64, 3), shade, dtype=np.uint8))
-    camera = {"image_size_wh": [64, 48], "K": [[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]}
-    content = {"units": "metre, pixel", "cameras": {"one": camera}}
-    (tmp_path / "cameras.json").write_text(json.dumps(content))
-    points = np.array([[40.0, 10], [30, 20], [22, 30], [20, 36]])
-    np.savez(
-        tmp_path / "keypoints.npz",
-        keypoints=points + np.arange(3.0)[:, None, None],
-        confidence=np.ones((3, 4)),
-        joint_names=np.array(["r_shoulder", "r_elbow", "r_wrist", "r_hand_tip"]),
-    )
-    return tmp_path
-
-
-def track(files: Path, *more: str) -> int:
-    return cli.main(
-        [
-            "track", str(files / "video.mp4"), "--camera", str(files / "cameras.json"),
-            "--keypoints", str(files / "keypoints.npz"), "--body", "arm7", "--samples", "3",
-            "--modes", "2", "--terms", "joints", "--out", str(files / "out"), *more,
-        ]
-    )  # fmt: skip
+def files(files: Path) -> Path:
+    """The clip without content, and marks that move."""
+    with np.load(files / "keypoints.npz") as archive:
+        arrays = dict(archive)
+    arrays["keypoints"] += np.arange(3.0)[:, None, None]
+    np.savez(files / "keypoints.npz", **arrays)
+    return files
 
 
 def test_a_live_recording_is_the_track(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:

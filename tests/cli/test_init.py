@@ -8,10 +8,9 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from made_sequences import rendered_arm
+from made_sequences import rendered_arm, write_clip
 
 from torchcss.app.init import write_png
 from torchcss.cli import init as cli_init
@@ -19,7 +18,7 @@ from torchcss.cli import main as cli
 from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.io.tracks import load_track
-from torchcss.io.video import VideoReader, VideoWriter, read_image
+from torchcss.io.video import VideoReader, read_image
 from torchcss.types import Keypoints
 
 
@@ -28,28 +27,11 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A rendered arm as picture and as video, with its camera and joints as files."""
     folder = tmp_path_factory.mktemp("scene")
     sequence = rendered_arm(3, 2)
-    with VideoWriter(folder / "video.mp4", 25) as film:
-        for frame in sequence.frames:
-            film.write(frame)
+    write_clip(folder, sequence)
     write_png(folder / "picture.png", sequence.frames[0])
-    camera = sequence.camera
-    entry = {
-        "image_size_wh": list(camera.image_size_wh),
-        "K": camera.K.tolist(),
-        "R": camera.R_camera_world.tolist(),
-        "t": camera.t_camera_world.tolist(),
-    }
-    (folder / "cameras.json").write_text(
-        json.dumps({"units": "metre, pixel", "cameras": {"one": entry}})
-    )
-    uv = camera.project(sequence.joints_world).uv
-    names = sequence.body.joint_names
-    marks = dict(zip(names, uv[0].tolist(), strict=True))
+    uv = sequence.camera.project(sequence.joints_world[0]).uv
+    marks = dict(zip(sequence.body.joint_names, uv.tolist(), strict=True))
     (folder / "joints.json").write_text(json.dumps({"joints": marks}))
-    np.savez(
-        folder / "keypoints.npz", keypoints=uv.numpy(), confidence=np.ones(uv.shape[:2]),
-        joint_names=np.array(names),
-    )  # fmt: skip
     return folder
 
 

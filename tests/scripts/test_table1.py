@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchcss.inference.proposals import CovarianceScaled
-from torchcss.studies.sampling_study import run_sampler, spectrum, study_problem
+from torchcss.studies.sampling_study import StudyChoice, run_sampler, spectrum, study_problem
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "table1.py"
 
@@ -54,8 +54,8 @@ def test_medians_and_a_given_pose(script: ModuleType, tmp_path: Path) -> None:
     pose = tmp_path / "pose.json"
     pose.write_text(json.dumps({"r_elbow_flexion": 1.2, "r_shoulder_swing": -0.5}))
     config = script.Config(
-        body="arm8", samples=40, scales=(4.0,), num_seeds=2, pose=pose, robust=True, limits=False,
-        exact_steps=False, correlated_projection=True,
+        body="arm8", samples=40, scales=(4.0,), num_seeds=2, pose=pose, exact_steps=False,
+        choice=StudyChoice(robust=True, limits=False), correlated_projection=True,
     )  # fmt: skip
     report = script.main(config)
     assert len(report["runs"]) == 2

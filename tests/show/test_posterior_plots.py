@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_clip import grey_film
 from made_robots import write_arm
 from made_tracks import make_track
 from matplotlib.axes import Axes
@@ -20,16 +21,10 @@ from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli import main as cli
 from torchcss.errors import TrackFileError
 from torchcss.io.tracks import TRACK_NAME, Track, save_track
-from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure, joints_figure, spectra_figure
 from torchcss.show.style import DEVIATIONS, save_figure
 from torchcss.show.track_plots import effective_number
 from torchcss.studies.render.scene import look_at
-
-
-@pytest.fixture(scope="module")
-def body() -> BodyModel:
-    return load_body("arm8")
 
 
 @pytest.fixture(scope="module")
@@ -166,9 +161,7 @@ def test_the_verb_writes_every_figure(
     track: Track, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_track(tmp_path / TRACK_NAME, track)
-    with VideoWriter(tmp_path / "overlay.mp4", 25) as film:
-        for level in (40, 90, 150, 200):
-            film.write(np.full((48, 64, 3), level, np.uint8))
+    grey_film(tmp_path / "overlay.mp4", (40, 90, 150, 200))
     out = tmp_path / "figures"
     assert cli.main(["plot", str(tmp_path), "--out", str(out)]) == 0
     names = {"modes", "joints", "angles", "spectra", "side_view", "frames"}

@@ -8,15 +8,15 @@ from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
-import numpy as np
 import pytest
+from made_clip import grey_film
 from made_tracks import make_track
 
 from torchcss.body.load import load_body
 from torchcss.cli import main as cli
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME, save_track, write_summary
-from torchcss.io.video import VideoReader, VideoWriter
+from torchcss.io.video import VideoReader
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show import report
 from torchcss.vision.camera import Camera
@@ -34,9 +34,7 @@ def folder(tmp_path: Path) -> Path:
     for name in (TRACK_NAME, "smooth.npz"):
         save_track(folder / name, track)
     write_summary(folder, {"notes": ["<script>alert(1)</script>", "focal length assumed"]})
-    with VideoWriter(folder / "overlay.mp4", 25) as film:
-        for level in (40, 120, 200):
-            film.write(np.full((600, 800, 3), level, np.uint8))
+    grey_film(folder / "overlay.mp4", (40, 120, 200), camera.image_size_wh)
     return folder
 
 

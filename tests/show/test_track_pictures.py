@@ -8,25 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_clip import grey_film
 from made_tracks import make_track
 
-from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, TrackFileError, VideoError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.run import Given, Run
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
-from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show.posterior_plots import plot_track
 from torchcss.show.track_pictures import has_pictures, pictures_of
 from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
-
-
-@pytest.fixture(scope="module")
-def body() -> BodyModel:
-    return load_body("arm8")
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +41,7 @@ def folder(tmp_path: Path, track: Track, camera: Camera) -> Path:
     calibration = {"units": "metre, pixel", "cameras": {camera.name: camera_entry(camera)}}
     write_summary(tmp_path, {"events": [], **calibration})
     for name, levels in (("overlay.mp4", (40, 120, 200)), ("video.mp4", (90, 90, 90, 90, 90))):
-        with VideoWriter(tmp_path / name, 25) as film:
-            for level in levels:
-                film.write(np.full((144, 192, 3), level, np.uint8))
+        grey_film(tmp_path / name, levels, camera.image_size_wh)
     return tmp_path
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_clip import grey_film
 from made_tracks import make_track
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -14,20 +15,9 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
 from torchcss.io.tracks import Track
-from torchcss.io.video import VideoWriter
 from torchcss.show import track_plots
 from torchcss.show.style import save_figure
 from torchcss.studies.render.scene import look_at
-
-
-@pytest.fixture(scope="module")
-def body() -> BodyModel:
-    return load_body("arm8")
-
-
-@pytest.fixture(scope="module")
-def track(body: BodyModel) -> Track:
-    return make_track(body, (2, 3, 2), first_frame=10)
 
 
 def legend(figure: Figure) -> list[str]:
@@ -132,10 +122,7 @@ def test_short_tracks_can_be_drawn(body: BodyModel, tmp_path: Path, count: int) 
 
 
 def test_a_contact_sheet_shows_the_frames_asked_for(tmp_path: Path) -> None:
-    video = tmp_path / "made.mp4"
-    with VideoWriter(video, 25) as film:
-        for level in (0, 60, 120, 180, 240):
-            film.write(np.full((48, 720, 3), level, np.uint8))
+    video = grey_film(tmp_path / "made.mp4", (0, 60, 120, 180, 240), (720, 48))
     figure = track_plots.contact_sheet(video, (4, 0, 2), columns=2)
     shown = [axes for axes in figure.axes if axes.get_images()]
     titles = [axes.get_title() for axes in shown]
@@ -152,10 +139,7 @@ def test_a_contact_sheet_shows_the_frames_asked_for(tmp_path: Path) -> None:
 def test_a_contact_sheet_of_an_overlay_counts_as_the_track_does(
     track: Track, tmp_path: Path
 ) -> None:
-    overlay = tmp_path / "overlay.mp4"
-    with VideoWriter(overlay, 25) as film:
-        for level in (0, 120, 240):
-            film.write(np.full((48, 64, 3), level, np.uint8))
+    overlay = grey_film(tmp_path / "overlay.mp4", (0, 120, 240))
     figure = track_plots.contact_sheet(overlay, track.frames[1:], track=track)
     assert [axes.get_title() for axes in figure.axes] == ["frame 11, 0.18 s", "frame 12, 0.20 s"]
     means = [np.asarray(axes.get_images()[0].get_array()).mean() for axes in figure.axes]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from made_clip import grey_film
 from made_tracks import make_track
 from PIL import Image
 
@@ -21,7 +22,6 @@ from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, MissingExtraError, OutputError
 from torchcss.io.run import Run
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
-from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show import viewer
 from torchcss.show.overlay import PALETTE
@@ -42,26 +42,14 @@ def run_of(track: Track, camera: Camera | None, folder: Path = Path("run")) -> R
 
 
 @pytest.fixture(scope="module")
-def body() -> BodyModel:
-    return load_body("arm8")
-
-
-@pytest.fixture(scope="module")
 def camera() -> Camera:
     return look_at((0.3, -1.0, 5.0), (0.3, -1.0, 0.0), focal_px=60, image_size_wh=(64, 48))
 
 
 @pytest.fixture(scope="module")
-def track(body: BodyModel) -> Track:
-    return make_track(body, (2, 3, 2), first_frame=10)
-
-
-@pytest.fixture(scope="module")
 def run(track: Track, camera: Camera, tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp("run")
-    with VideoWriter(folder / "overlay.mp4", 25) as film:
-        for level in (40, 120, 200):
-            film.write(np.full((48, 64, 3), level, np.uint8))
+    grey_film(folder / "overlay.mp4", (40, 120, 200))
     return run_of(track, camera, folder)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from collections.abc import Iterable, Mapping
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from made_sequences import rendered_arm
+from made_clip import grey_film
+from made_sequences import rendered_arm, write_clip
 from made_sessions import seen_by, session_at, start_at
 from torch import Tensor
 
@@ -34,10 +34,9 @@ from torchcss.initialise.view import CameraView
 from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.run import body_of_track
-from torchcss.io.video import VideoWriter
 from torchcss.robust import Quadratic
 from torchcss.studies.demo import run_demo
-from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.limb_moves import LostLimbs
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.session import Posterior, TrackingSession, follow_with_base
@@ -59,34 +58,7 @@ FRAMES = 4
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short rendered clip of an arm with camera and keypoints, as files."""
-    folder = tmp_path_factory.mktemp("clip")
-    generator = torch.Generator().manual_seed(3)
-    sequence = arm_sequence(generator=generator, num_frames=FRAMES)
-    with VideoWriter(folder / "video.mp4", sequence.frame_rate) as film:
-        for frame in sequence.frames:
-            film.write(frame)
-    camera = sequence.camera
-    (folder / "cameras.json").write_text(
-        json.dumps(
-            {
-                "units": "metre, pixel",
-                "cameras": {
-                    "one": {
-                        "video": "video.mp4",
-                        "image_size_wh": list(camera.image_size_wh),
-                        "K": camera.K.tolist(),
-                        "R": camera.R_camera_world.tolist(),
-                        "t": camera.t_camera_world.tolist(),
-                    }
-                },
-            }
-        )
-    )
-    uv = camera.project(sequence.joints_world).uv.numpy()
-    names = np.array(sequence.body.joint_names)
-    np.savez(
-        folder / "keypoints.npz", keypoints=uv, confidence=np.ones(uv.shape[:2]), joint_names=names
-    )
+    folder = write_clip(tmp_path_factory.mktemp("clip"), rendered_arm(3, FRAMES))
     few = Settings(body="arm7", samples=2, modes=1, overlay=False, terms=("joints",))
     track_video(
         folder / "video.mp4",
@@ -406,10 +378,7 @@ def test_a_demo_without_frames_is_refused(tmp_path: Path, number: int):
 
 
 def write_masks(path: Path, width: int, height: int, num_frames: int = FRAMES) -> Path:
-    with VideoWriter(path, 25) as film:
-        for _ in range(num_frames):
-            film.write(np.full((height, width, 3), 255, np.uint8))
-    return path
+    return grey_film(path, [255] * num_frames, (width, height))
 
 
 def test_masks_are_read_along_with_the_video(clip: Path, tmp_path: Path):

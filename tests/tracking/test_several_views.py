@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_clip import write_film
 from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at
 
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError, VideoError
-from torchcss.io.cameras import read_camera
+from torchcss.io.cameras import camera_entry, read_camera
 from torchcss.io.run import Given, Run
 from torchcss.io.tracks import load_track
-from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import ViewFiles
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.session import Posterior
@@ -129,23 +129,16 @@ def folder(
     path = tmp_path_factory.mktemp("views")
     cameras = {}
     for name, camera, ahead in (("front", sequence.camera, 0), ("side", side, 2)):
-        width, height = camera.image_size_wh
-        with VideoWriter(path / f"{name}.mp4", sequence.frame_rate) as film:
-            for i in range(FRAMES if name == "front" else FRAMES + 1):
-                film.write(sequence.frames[i] if name == "front" else flat((width, height)))
+        front = list(sequence.frames)
+        images = front if name == "front" else [flat(camera.image_size_wh)] * (FRAMES + 1)
+        write_film(path / f"{name}.mp4", images, sequence.frame_rate)
         uv = camera.project(sequence.joints_world).uv.numpy()
         uv = np.concatenate([uv[:1]] * ahead + [uv])[: FRAMES + (1 if ahead else 0)]
         np.savez(
             path / f"{name}.npz", keypoints=uv, confidence=np.ones(uv.shape[:2]),
             joint_names=np.array(sequence.body.joint_names),
         )  # fmt: skip
-        cameras[name] = {
-            "video": f"{name}.mp4",
-            "image_size_wh": [width, height],
-            "K": camera.K.tolist(),
-            "R": camera.R_camera_world.tolist(),
-            "t": camera.t_camera_world.tolist(),
-        }
+        cameras[name] = {"video": f"{name}.mp4", **camera_entry(camera)}
     text = {"units": "metre, pixel", "cameras": cameras}
     (path / "cameras.json").write_text(json.dumps(text))
     for entry in cameras.values():
