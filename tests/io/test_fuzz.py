@@ -25,10 +25,12 @@ from made_flows import write_flow
 from made_tracks import make_track
 from scipy.io import savemat
 
+from torchcss.body.files.mesh import mesh_points
 from torchcss.body.load import load_body
 from torchcss.errors import TorchcssError, TrackFileError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
+from torchcss.io.calibrations import read_entries
 from torchcss.io.cameras import read_camera
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
@@ -117,6 +119,13 @@ MJCF = """<mujoco><compiler angle="degree"/><default><geom type="capsule"/></def
 <body name="b" pos="0 0 .4" quat="1 0 1 0"><joint axis="0 1 0" range="-60 30" pos="0 0 .1"/>
 <geom size=".05 .1" pos="0 0 .2"/><body pos="0 0 .4"><joint type="ball" range="0 50"/></body>
 </body></body></worldbody></mujoco>
+"""
+COLLADA = """<COLLADA><asset><unit meter="0.01"/></asset><library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array>-5 -3 0 5 3 0 0 0 40</float_array></source>
+<vertices><input semantic="POSITION" source="#p"/></vertices></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene><node><matrix>1 0 0 2 0 1 0 0 0 0 1 0 0 0 0 1</matrix>
+<rotate>0 2 0 90</rotate><scale>1 2 1</scale><instance_geometry url="#g"/></node></visual_scene>
+</library_visual_scenes></COLLADA>
 """
 INTRI = """%YAML:1.0
 ---
@@ -210,7 +219,10 @@ READERS = (
     Reader("annotations.json", keypoints),
     Reader("pandas.json", keypoints),
     Reader("via.json", keypoints),
+    Reader("via3.json", keypoints),
     Reader("labelstudio.json", keypoints),
+    Reader("cells.csv", keypoints),
+    Reader("times.csv", keypoints),
     Reader("triples.npy", keypoints),
     Reader("sleap.csv", keypoints),
     Reader("sleap.analysis.h5", keypoints),
@@ -224,13 +236,18 @@ READERS = (
     Reader("kalibr.yaml", read_camera),
     Reader("cameras.txt", read_camera),
     Reader("opencv.xml", read_camera),
+    Reader("metashape.xml", read_camera),
     Reader("camera.npz", read_camera),
+    Reader("several.npz", lambda path: read_camera(path, "1")),
+    Reader("named.json", lambda path: read_camera(path, "b")),
+    Reader("matrices/0.txt", beside(read_entries)),
     Reader("camera.mat", read_camera),
     Reader("motion.bvh", read_motion_capture),
     Reader("motion.amc", read_motion_capture),
     Reader("motion.asf", lambda path: read_motion_capture(path.with_suffix(".amc"))),
     Reader("motion.bvh", load_body),
     Reader("robot.urdf", load_body),
+    Reader("a.dae", mesh_points),
     Reader("robot.xml", load_body),
     Reader("a.flo", read_flow),
     Reader("track.npz", load_track),
@@ -288,6 +305,13 @@ def write_keypoints(folder: Path, marks: np.ndarray) -> None:
             {"shape_attributes": {"name": "point", "cx": u, "cy": v},
              "region_attributes": {"joint": name}} for name, (u, v) in each.items()]}
              for t, each in enumerate(named)},
+        "via3": {
+            "attribute": {"1": {"aname": "joint", "options": skeleton}},
+            "file": {f"{t}": {"fid": t, "fname": f"{t}.png"} for t in range(T)},
+            "view": {f"{t}": {"fid_list": [t]} for t in range(T)},
+            "metadata": {f"{t}_{i}": {"vid": f"{t}", "z": [], "xy": [1, *uv], "av": {"1": f"{i}"}}
+                         for t, each in enumerate(named) for i, uv in enumerate(each.values())},
+        },
         "labelstudio": [{"data": {"image": f"{t}.png"}, "annotations": [{"result": [
             {"type": "keypointlabels", "original_width": 64, "original_height": 48,
              "value": {"x": u / 0.64, "y": v / 0.48, "keypointlabels": [name]}}
@@ -304,6 +328,10 @@ def write_keypoints(folder: Path, marks: np.ndarray) -> None:
     (folder / "sleap.csv").write_text(
         "\n".join([f"track,frame_idx,instance.score,{heading}", *rows])
     )
+    cells = [f'{t},"{each["keypoints"]}"' for t, each in enumerate(x)]
+    (folder / "cells.csv").write_text("\n".join(["frame,keypoints", *cells]))
+    codes = [f"00:00:00.{40 * t:03d},{','.join(map(str, f[:3].flat))}" for t, f in enumerate(marks)]
+    (folder / "times.csv").write_text("\n".join([f"timestamp,{heading}", *codes]))
     h5py = pytest.importorskip("h5py")
     with h5py.File(folder / "sleap.analysis.h5", "w") as file:
         file["tracks"] = marks[None, ..., :2].transpose(0, 3, 2, 1)
@@ -331,6 +359,18 @@ def write_calibrations(folder: Path) -> None:
         f"{' '.join(map(str, np.ravel(K)))}</data></camera_matrix></opencv_storage>"
     )
     np.savez(folder / "camera.npz", mtx=np.array(K), dist=np.zeros((1, 5)), size=np.array(SIZE))
+    (folder / "metashape.xml").write_text(
+        "<calibration><projection>frame</projection><width>64</width><height>48</height><f>60</f>"
+        "<cx>0.5</cx><cy>-0.5</cy><k1>0.1</k1><p1>0.01</p1></calibration>"
+    )
+    P = np.column_stack([K, [1.0, 2.0, 3.0]])
+    size = np.array(SIZE)
+    np.savez(folder / "several.npz", K=np.array([K, K]), dist=np.zeros((2, 5)), image_size=size)
+    (folder / "named.json").write_text(
+        json.dumps({"a": P.tolist(), "b": P.tolist(), "image_size": SIZE})
+    )
+    (folder / "matrices").mkdir()
+    np.savetxt(folder / "matrices" / "0.txt", P)
     savemat(folder / "camera.mat", {"K": np.array(K), "ImageSize": SIZE[::-1]}, do_compression=True)
 
 
@@ -381,6 +421,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / f"motion.{name}").write_text(text)
     (folder / "robot.urdf").write_text(URDF)
     (folder / "robot.xml").write_text(MJCF)
+    (folder / "a.dae").write_text(COLLADA)
     write_flow(folder / "a.flo", torch.randn(2, 4, 5, generator=torch.Generator().manual_seed(0)))
     save_track(folder / "track.npz", make_track(body, (2, 1, 2)))
     write_checkpoint(folder, Checkpoint(2, {"a": torch.zeros(3), "b": torch.tensor(1)}))

@@ -309,16 +309,16 @@ def _square(value: Any, size: int) -> np.ndarray | None:
 
 def _parts_of(projection: np.ndarray) -> dict[str, Any]:
     """K, rotation and translation of a 3 x 4 matrix that projects points of the world."""
-    with refusing(CameraError, "not a camera's projection matrix"):
+    with refusing(CameraError, "not a camera's projection matrix"), np.errstate(all="ignore"):
         projection = projection * np.sign(np.linalg.det(projection[:, :3]))
         turn, inverse = np.linalg.qr(np.linalg.inv(projection[:, :3]))
         signs = np.diag(np.sign(np.diag(inverse)))
         inverse = signs @ inverse
         K = np.triu(np.linalg.inv(inverse))
-    K /= K[2, 2]
-    if abs(K[0, 1]) < _ROUNDING * K[0, 0]:
-        K[0, 1] = 0
-    rotation, translation = (turn @ signs).T, inverse @ projection[:, 3]
+        K /= K[2, 2]
+        if abs(K[0, 1]) < _ROUNDING * K[0, 0]:
+            K[0, 1] = 0
+        rotation, translation = (turn @ signs).T, inverse @ projection[:, 3]
     return {
         "K": K.tolist(), "rotation": rotation.tolist(), "translation": translation.tolist()
     }  # fmt: skip
