@@ -1406,3 +1406,57 @@ def test_xml_in_a_folder(tmp_path: Path) -> None:
     )  # fmt: skip
     path = write(tmp_path / "cvat" / "annotations.xml", f"<annotations>{images}</annotations>")
     check(read(path.parent))
+
+
+@pytest.mark.parametrize("seen", ["True", "85%", "2"])
+def test_confidences_in_other_words(tmp_path: Path, seen: str) -> None:
+    heading = ",".join(f"{n}_x,{n}_y,{n}_visible" for n in TFJS)
+    hidden = {"True": "False", "85%": "0 %", "2": "1"}[seen]
+    rows = [",".join(f"{x},{y},{seen if n % 3 else hidden}" for n, (x, y, _) in
+                     enumerate(person(t))) for t in T]  # fmt: skip
+    found = read(write(tmp_path / "a.csv", "\n".join([heading, *rows])))
+    check(found, names=("r_eye", "r_wrist"))
+    expected = {"True": (0, 1), "85%": (0, 0.85), "2": (0.5, 1)}[seen]
+    assert found.confidence.unique().tolist() == pytest.approx(expected)
+    assert sum("taken" in line for line in found.report) == (seen != "True")
+    if seen == "True":
+        entries = [{"frame": t, "keypoints": [{"name": n, "x": x, "y": y, "visible": n != "nose"}
+                    for n, (x, y, _) in zip(TFJS, person(t), strict=True)]} for t in T]  # fmt: skip
+        check(read(write(tmp_path / "a.json", entries)), names=LIMBS[:4])
+
+
+@pytest.mark.parametrize("form", ["json", "csv"])
+def test_nanoseconds(tmp_path: Path, form: str) -> None:
+    times = {f"{1_700_000_000_000_000_000 + 40_000_000 * t}": t for t in SEEN}
+    if form == "csv":
+        path = write(tmp_path / "a.csv", headed({k: person(t) for k, t in times.items()}, "time"))
+    else:
+        entries = [{"timestamp": int(k), "joints": person(t).tolist()} for k, t in times.items()]
+        path = write(tmp_path / "a.json", entries)
+    check(read(path, frame_rate=25.0), (3,))
+
+
+def test_the_number_of_a_picture_is_the_one_that_changes(tmp_path: Path) -> None:
+    entries = [{"image_id": f"GOPR0042_{t:04d}_1080p.jpg", "keypoints": flat(t)} for t in SEEN]
+    check(read(write(tmp_path / "a.json", entries)), (3,))
+
+
+def test_files_without_numbers_are_as_many_as_the_frames(tmp_path: Path) -> None:
+    for t in SEEN:
+        write(tmp_path / "a" / f"{'abcdef'[t]}.json", {"people": [{"keypoints": flat(t)}]})
+    with pytest.raises(KeypointError, match="expected 6 frames, as the video has, found 5"):
+        read(tmp_path / "a")
+    write(tmp_path / "a" / "d.json", {"people": []})
+    check(read(tmp_path / "a"), (3,))
+
+
+def test_people_without_a_number(tmp_path: Path) -> None:
+    heading, *rows = headed({f"{t},none": person(t) for t in T}, "frame,person_id").split("\n")
+    rows += headed({f"{t},None": other(t) for t in T}).split("\n")[1:]
+    check(read(write(tmp_path / "a.csv", "\n".join([heading, *rows]))))
+
+
+def test_arrays_as_ultralytics_calls_them(tmp_path: Path) -> None:
+    stack = np.stack([person(t) for t in T])
+    np.savez(tmp_path / "a.npz", xy=stack[..., :2], conf=stack[..., 2], names=np.array(TFJS))
+    check(read(tmp_path / "a.npz"))

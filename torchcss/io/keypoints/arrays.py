@@ -34,7 +34,7 @@ from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIZES, firs
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
-_PLACES = names_in("keypoints keypoints2d joints2d kps kpts poses positions pose joints")
+_PLACES = names_in("keypoints keypoints2d joints2d kps kpts poses positions pose joints xy")
 MOST_BYTES = 2**31
 """Bytes of the largest set of arrays of keypoints: as of 33 people with 133 in 20,000 frames."""
 

@@ -44,12 +44,6 @@ def read_coco(content: Mapping[str, Any]) -> People:
             track = track_of({**entry, **(about if isinstance(about, dict) else {})}, ("trackid",))
             people = one_person(where, entry["keypoints"], entry)
             found.setdefault(image, []).extend(person._replace(track=track) for person in people)
-    values = {value for people in found.values() for p in people for value in p.joints[:, 2]}
-    if 2 in values and values <= {0, 1, 2}:
-        # 0 not labelled, 1 labelled but hidden, 2 seen.
-        for image, people in found.items():
-            found[image] = [p._replace(joints=p.joints * (1.0, 1.0, 0.5)) for p in people]
-        report.append("visibility 0, 1, 2 of the annotations taken as confidence 0, 0.5, 1")
     if "images" not in content:
         return People(found, names, report)
     frames, size = _by_images(content["images"], found)

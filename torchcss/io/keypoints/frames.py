@@ -98,7 +98,8 @@ def in_seconds(time: str, frames: Frames) -> Frames:
     unit = TIMES[time]
     if unit is None:
         gap = float(np.diff(np.sort(np.array(list(frames), float))).min(initial=np.inf))
-        unit = 1.0 if gap < 1 or not np.isfinite(gap) else 1e-3 if gap < 1000 else 1e-6
+        most = {1.0: 1.0, 1000.0: 1e-3, 5e6: 1e-6, np.inf: 1e-9}  # of a gap, and what counts it
+        unit = next((each for end, each in most.items() if gap < end), 1.0)
     return {unit * float(key): people for key, people in frames.items()}
 
 
@@ -143,8 +144,10 @@ def _unpadded(name: str) -> str:
 
 
 def _by_number(people: People, keys: Sequence[Key], film: Film, report: list[str]) -> list[int]:
-    numbers = [key if isinstance(key, int) else _number(str(key)) for key in keys]
+    numbers = _numbers(keys)
     if people.whole and None in numbers:
+        if film.num_frames not in (None, len(keys)):
+            raise wrong_count(film.num_frames or 0, len(keys))
         report.append("frames in the order of the names")
         return list(range(len(keys)))
     if None in numbers:
@@ -179,12 +182,17 @@ def _first(people: People, places: Sequence[int], num_frames: int | None) -> int
     return 1 if low and high == num_frames else 0
 
 
-def _number(text: str) -> int | None:
-    """The last number in a picture's name."""
-    digits = re.findall(r"[0-9]+", plain_name(text))
-    if not digits or len(digits[-1]) > 12 or text.startswith("-"):
-        return None
-    return int(digits[-1])
+def _numbers(keys: Sequence[Key]) -> list[int | None]:
+    """The numbers of frames; of a picture's name the last one that not all names have."""
+    digits = [re.findall(r"[0-9]+", plain_name(str(key))) for key in keys]
+    ends = range(-1, -1 - min(map(len, digits), default=0), -1)
+    at = next((end for end in ends if len({each[end] for each in digits}) > 1), -1)
+    return [
+        key if isinstance(key, int)
+        else int(each[at]) if each and len(each[at]) <= 12 and not str(key).startswith("-")
+        else None
+        for key, each in zip(keys, digits, strict=True)
+    ]  # fmt: skip
 
 
 def _by_time(times: Sequence[float], film: Film, report: list[str]) -> list[int]:

@@ -83,8 +83,8 @@ _OTHERS = {
 }
 """Files of other kinds by words in them, and what to do."""
 
-_HUGE = 1e17
-"""No number of a frame is so large, nor a time, were it in microseconds since 1970."""
+_HUGE = 1e19
+"""No number of a frame is so large, nor a time, were it in nanoseconds since 1970."""
 
 _FRAMES = ("frames", "instance_info", "results", "data")
 

@@ -234,7 +234,7 @@ def _row(where: str, row: Any) -> list[float]:
         if not isinstance(place, dict) or not {"x", "y"} <= place.keys():
             raise unexpected(KeypointError, where, "x, y and visibility", row)
         given = first_of(row, CONFIDENCES)
-        row = [place["x"], place["y"], given]
+        row = [place["x"], place["y"], float(given) if isinstance(given, bool) else given]
     elif isinstance(row, list) and len(row) == 4:
         row = [row[0], row[1], row[3]]  # x, y, z, visibility
     values = number_array(row, where)

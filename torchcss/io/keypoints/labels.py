@@ -59,7 +59,5 @@ def _person(where: str, words: list[str], image_size_wh: Size) -> Person:
     seen = (joints[:, :2] != 0).any(1)
     places = np.where(seen[:, None], joints[:, :2] * image_size_wh, np.nan)
     confidence = joints[:, 2] if size == 3 else None
-    if confidence is not None and confidence.max() == 2:
-        confidence = 0.5 * confidence  # annotations: 1 hidden, 2 seen
     track = str(int(values[-1])) if more == 2 or (more == 1 and values[-1] >= 1) else None
     return Person(screened(places, confidence), track)

@@ -338,7 +338,10 @@ def _checked_numbers(
     checked, clipped = [], 0
     counts = np.concatenate([np.zeros(0), *(frame[..., 2].ravel() for frame in frames)])
     most = float(np.max(counts, initial=0.0, where=np.isfinite(counts)))
-    if _PERCENT < most <= 100.0 and not (counts < 0.0).any():
+    if most == 2.0 and {*counts.tolist()} <= {0.0, 1.0, 2.0}:  # not labelled, hidden, seen
+        report.append("visibility 0, 1, 2 taken as confidence 0, 0.5, 1")
+        frames = [frame * (1.0, 1.0, 0.5) for frame in frames]
+    elif _PERCENT < most <= 100.0 and not (counts < 0.0).any():
         report.append(f"confidences run to {most:g}: they are taken for percent")
         frames = [frame * (1.0, 1.0, 0.01) for frame in frames]
     for index, frame in enumerate(frames):

@@ -430,9 +430,11 @@ def _number(where: str, cell: str) -> float:
     """A number; what is not there is NaN."""
     if not cell or cell.lower() in _ABSENT:
         return np.nan
+    if cell.lower() in ("true", "false"):
+        return float(cell.lower() == "true")
     try:
         if "_" not in cell:
-            return float(cell)
+            return float(cell.removesuffix("%"))
     except ValueError:
         pass
     raise unexpected(KeypointError, where, "a number", cell)

@@ -26,6 +26,7 @@ FRAMES = names_in(
 TIMES: dict[str, float | None] = {
     **dict.fromkeys(("timestampms", "timems", "milliseconds"), 1e-3),
     **dict.fromkeys(("timestampus", "timeus"), 1e-6),
+    **dict.fromkeys(("timestampns", "timens", "nanoseconds"), 1e-9),
     **dict.fromkeys(("timestamps", "times", "timesec", "timeseconds", "seconds"), 1.0),
     **dict.fromkeys(("timestamp", "time", "timecode", "t"), None),
 }
@@ -115,4 +116,4 @@ def seconds_in(text: str) -> float | None:
 def track_text(value: float | str) -> str | None:
     """By what a person is known again, as text; None: the file does not know him."""
     text = re.sub(r"\.0*$", "", str(value))
-    return None if text in ("-1", "", "nan") else text
+    return None if text.lower() in ("-1", "", "nan", "none", "null") else text
