@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from reference.kinematics import rotation
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import TrackFileError
@@ -42,10 +43,8 @@ def make_track(
     upper = body.upper.clamp(max=spread)
     for index, k in enumerate(counts):
         # Two bases, as when the pitch of the root has come near a right angle.
-        lean = torch.tensor([0.2, -0.3, 0.1]) if index < 2 else torch.tensor([-0.4, 0.5, 0.2])
-        skew = torch.zeros(3, 3, dtype=torch.float64)
-        skew[0, 1], skew[0, 2], skew[1, 2] = lean.double()
-        turn = up @ torch.linalg.matrix_exp(skew - skew.T)
+        lean = (-0.1, -0.3, -0.2) if index < 2 else (-0.2, 0.5, 0.4)
+        turn = up @ rotation(*lean)
         shift = torch.tensor([0.3, -1.2, 0.9 + 0.1 * index], dtype=torch.float64)
         placed = body.with_base(turn, shift)
         share = torch.rand(k, n, generator=source, dtype=torch.float64)

@@ -12,6 +12,7 @@ import pytest
 import torch
 from made_clip import track
 from made_tracks import make_track
+from reference.kinematics import rotation
 
 from torchcss import load_body, load_track
 from torchcss.app.smooth import report, smooth, smooth_track
@@ -186,10 +187,8 @@ def test_a_base_that_moves_changes_nothing(axis: tuple[float, ...], tolerance_m:
     # About the upright axis the coordinates differ by a constant; else the angles, and what is
     # expected of their motion, are others. The noise of the joints is 100 mm.
     body = load_body("body30")
-    x, y, z = axis
-    turn = torch.linalg.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]).double())
     still, _ = noisy_track(body, 12)
-    moving, truth = noisy_track(body, 12, moved_at=6, turn=turn)
+    moving, truth = noisy_track(body, 12, moved_at=6, turn=rotation(*axis))
     one, other = smooth_track(still), smooth_track(moving)
     assert one.modes.tolist() == other.modes.tolist()
     assert other.track.joints_world == pytest.approx(one.track.joints_world, abs=tolerance_m)

@@ -40,7 +40,7 @@ def by_hand(tree: KinematicTree, q: Tensor) -> tuple[Tensor, Tensor]:
 
 def awkward_tree() -> KinematicTree:
     """Branches, oblique axes that are not unit, turned offsets, fixed joints in between."""
-    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([0.3, 1.0, -2.0]).double()))
+    turn = reference.rotation(0.3, 1.0, -2.0)
     rotation = tuple(tuple(row) for row in turn.tolist())
     return KinematicTree(
         [
@@ -97,7 +97,7 @@ def test_the_evaluation_has_the_poses_of_the_chain(
     if name.endswith(".xml"):
         pytest.importorskip("mujoco", reason="comes with the extra [mjcf]")
     body = load_body(name if name in BODY_NAMES else shared_data / name)
-    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([1.0, -0.2, 0.7]).double()))
+    turn = reference.rotation(1.0, -0.2, 0.7)
     body = body.with_base(turn, torch.tensor([0.3, -2.0, 1.0]))
     x = torch.randn(2, 3, body.num_parameters, generator=generator, dtype=torch.float64)
     tree, chain = body.tree, body.tree.chain
@@ -118,7 +118,7 @@ def test_twists_move_points_as_autograd_says(
 ) -> None:
     q = torch.randn(tree.num_joints, generator=generator, dtype=torch.float64)
     offset = torch.randn(len(tree.link_names), 3, generator=generator, dtype=torch.float64)
-    base = torch.linalg.matrix_exp(reference.skew(torch.tensor([1.0, -0.2, 0.7]).double()))
+    base = reference.rotation(1.0, -0.2, 0.7)
     shift = torch.tensor([0.3, -2.0, 1.0], dtype=torch.float64)
 
     def points(q: Tensor) -> Tensor:
@@ -170,7 +170,7 @@ def test_one_compiled_call_is_the_same(
 ) -> None:
     """Tensors that want a derivative take the other way, and so do those of `torch.func`."""
     tree = (awkward_tree() if name == "awkward" else load_body(name).tree).to(dtype)
-    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([0.3, 1.0, -2.0]).double()))
+    turn = reference.rotation(0.3, 1.0, -2.0)
     base = torch.cat([turn, torch.tensor([[1.0], [2.0], [3.0]])], dim=1).to(dtype)
     for batch in ((), (0,), (1,), (3, 2)):
         q = torch.randn(*batch, tree.num_joints, generator=generator, dtype=torch.float64)
@@ -413,13 +413,6 @@ def test_missing_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.urdf").mkdir()
     with pytest.raises(BodyError, match=r"folder\.urdf: expected a file, found a folder"):
         load_body(tmp_path / "folder.urdf")
-
-
-def test_mjcf_is_no_urdf(shared_data: Path, tmp_path: Path) -> None:
-    robot = (shared_data / "robot_models" / "humanoid_gym.xml").read_text()
-    (tmp_path / "humanoid.urdf").write_text(robot)
-    with pytest.raises(BodyError, match="found <mujoco>"):
-        load_body(tmp_path / "humanoid.urdf")
 
 
 def test_what_urdf_leaves_out(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:

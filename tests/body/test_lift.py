@@ -38,7 +38,7 @@ class Problem(NamedTuple):
 
 def make_body(name: str, *, free: bool) -> BodyModel:
     body = load_body(name, free_proportions=free, lengths={"forearm": 0.25} if free else None)
-    turn = torch.linalg.matrix_exp(reference.skew(torch.tensor([0.4, -0.9, 0.3]).double()))
+    turn = reference.rotation(0.4, -0.9, 0.3)
     return body.with_base(turn, torch.tensor([0.3, -1.1, 4.0]).double())
 
 

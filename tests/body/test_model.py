@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from reference.kinematics import rotation
 from torch import Tensor
 
 from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, specification
@@ -192,9 +193,7 @@ def test_a_mesh_is_that_of_the_present_shape() -> None:
 def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
     body = load_body("body34")
     x = random_states(body, 2, generator=generator)
-    turn = torch.linalg.matrix_exp(
-        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]]).double()
-    )
+    turn = rotation(0.8, 0.3, 0.4)
     shift = torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)
     other = body.with_base(turn, shift)
     torch.testing.assert_close(other.pose(x).joints, body.pose(x).joints @ turn.T + shift)

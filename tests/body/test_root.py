@@ -8,18 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from made_robots import planar_arm
+from reference.kinematics import rotation
 from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, base_without_root, has_root, move_base, root_pose
 from torchcss.body.rotations import root_angles, root_rotation
-
-
-def rotation(*turn: float) -> Tensor:
-    x, y, z = turn
-    skew = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-    return torch.linalg.matrix_exp(skew)
 
 
 def based_body(name: str = "body34") -> BodyModel:

@@ -29,7 +29,7 @@ ARM = ("r_shoulder_swing", "r_shoulder_raising", "r_shoulder_twist", "r_elbow_fl
 
 
 def moved(body: BodyModel) -> BodyModel:
-    turn = torch.linalg.matrix_exp(kinematics.skew(torch.tensor([0.4, -0.9, 0.3]).double()))
+    turn = kinematics.rotation(0.4, -0.9, 0.3)
     return body.with_base(turn, torch.tensor([0.3, -1.1, 4.0]).double())
 
 

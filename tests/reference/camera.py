@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from reference.kinematics import rotation
 from torch import Tensor
 
 from torchcss.vision.camera import Camera, ProjectionModel
@@ -26,14 +27,11 @@ def skew_camera(
     name: str = "test",
 ) -> Camera:
     """A camera that stands askew, the world's origin some metres before it."""
-    rotation = torch.linalg.matrix_exp(
-        torch.tensor([[0.0, -0.4, 0.3], [0.4, 0.0, -0.8], [-0.3, 0.8, 0.0]], dtype=torch.float64)
-    )
     return Camera(
         [[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]],
         image_size_wh,
         distortion=distortion,
-        R_camera_world=rotation,
+        R_camera_world=rotation(0.8, 0.3, 0.4),
         t_camera_world=[0.1, -0.2, away],
         name=name,
     )

@@ -22,6 +22,11 @@ def skew(w: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
+def rotation(*vector: float) -> Tensor:
+    """Rotation about a vector by its length, radians."""
+    return torch.linalg.matrix_exp(skew(torch.tensor(vector, dtype=torch.float64)))
+
+
 def rodrigues(axis: Tensor, angle: Tensor) -> Tensor:
     """Rotation about a unit axis."""
     k = skew(axis)

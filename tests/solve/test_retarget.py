@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from reference.kinematics import rotation
 
 from torchcss.body.catalog import LENGTHS
 from torchcss.body.load import load_body
@@ -286,9 +287,8 @@ def test_a_tilted_floor_is_levelled(degrees: float, generator: torch.Generator) 
     joints[..., 1] = 0.8 * torch.rand(60, 5, generator=generator, dtype=torch.float64) + 0.1
     joints[:, 0, 1] = torch.where((t > 0.3) & (t < 0.6), 0.4, 0.0)
     joints[:, 0, ::2] = path[:, ::2]
-    axis = torch.tensor([1.2, 0.0, -0.8], dtype=torch.float64) / math.hypot(1.2, 0.8)
-    x, _, z = (axis * math.radians(degrees)).tolist()
-    turn = torch.linalg.matrix_exp(torch.tensor([[0, -z, 0], [z, 0, -x], [0, x, 0]]).double())
+    share = math.radians(degrees) / math.hypot(1.2, 0.8)
+    turn = rotation(1.2 * share, 0.0, -0.8 * share)
     found, report = levelled(joints @ turn.T, path @ turn.T)
     if 0.2 < abs(degrees) < 4:
         torch.testing.assert_close(found, joints, atol=2e-3, rtol=0)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from reference.kinematics import rotation
 from torch import Tensor
 
 from torchcss.body.load import load_body
@@ -211,11 +212,8 @@ def test_a_body_is_measured_alike_on_any_base() -> None:
     mean[:, 0] += 0.5  # beside where it is
     covariance = 1e-4 * torch.eye(34, dtype=torch.float64)[None]
     here = evaluator(tracked(body, mean, covariance=covariance, index=1), START, 0.0)
-    skew = torch.tensor([[0, -0.4, 0.2], [0.4, 0, 0.1], [-0.2, -0.1, 0]], dtype=torch.float64)
-    turn = torch.linalg.matrix_exp(skew)
-    other, there, spread = move_base(
-        body, turn, torch.tensor([0.3, -1.0, 0.2]).double(), mean, covariance
-    )
+    place = rotation(-0.1, 0.2, 0.4), torch.tensor([0.3, -1.0, 0.2]).double()
+    other, there, spread = move_base(body, *place, mean, covariance)
     assert spread is not None
     moved = evaluator(tracked(other, there, covariance=spread, index=1), START, 0.0)
     for one, two in zip(here[4:8], moved[4:8], strict=True):

@@ -14,6 +14,7 @@ import torch
 from made_tracks import BEAM_UP, export_as, make_track
 from reference.bvh import rotation
 from reference.c3d import read_c3d
+from reference.kinematics import rotation as turned_about
 
 from torchcss import load_body
 from torchcss.body.model import BodyModel
@@ -225,9 +226,7 @@ def posed_smpl(vectors: np.ndarray) -> list[np.ndarray]:
     """World orientations of SMPL's joints, by the exponential map."""
     world: list[np.ndarray] = []
     for vector, (_, parent, _) in zip(vectors.reshape(24, 3), SMPL_JOINTS, strict=True):
-        x, y, z = vector
-        skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
-        local = torch.linalg.matrix_exp(skew).numpy()
+        local = turned_about(*vector).numpy()
         world.append(local if parent < 0 else world[parent] @ local)
     return world
 
