@@ -84,6 +84,18 @@ FILES: dict[str, tuple[str, str]] = {
         json.dumps({"fx": FX, "fy": FY, "cx": CX, "cy": CY, "w": 640, "h": 480,
                     **dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True))}),
     ),
+    "MATLAB's structure as JSON": (
+        "cameraParams.json",
+        json.dumps({"cameraParams": {
+            "IntrinsicMatrix": [[FX, 0, 0], [0, FY, 0], [CX + 1, CY + 1, 1]],
+            "RadialDistortion": [LENS[0], LENS[1], LENS[4]],
+            "TangentialDistortion": LENS[2:4], "ImageSize": [480, 640]}}),
+    ),
+    "a list of cameras in capitals": (
+        "a.json",
+        json.dumps({"Unit": "mm", "Cameras": [{"Name": "a", "FocalLength": [FX, FY],
+            "PrincipalPoint": [CX, CY], "Resolution": [640, 480], "Distortion": LENS}]}),
+    ),
     "MATLAB's numbers as JSON, which count from 1": (
         "a.json",
         json.dumps({"IntrinsicMatrix": [[FX, 0, 0], [0, FY, 0], [CX + 1, CY + 1, 1]],
@@ -353,9 +365,13 @@ def test_colmaps_binary(tmp_path: Path) -> None:
     for place in (path, tmp_path):
         assert load_camera(place).camera.name == "3"
         check(place, LENS[:4])
-    for data in (head, b"x", struct.pack("<QiiQQ", 1, 3, 99, 640, 480)):
+    for data in (head, b"x"):
         path.write_bytes(data)
         with pytest.raises(CameraError, match=r"COLMAP's cameras\.bin"):
+            load_camera(path)
+    for model in (-1, 99):
+        path.write_bytes(struct.pack("<QiiQQ", 1, 3, model, 640, 480))
+        with pytest.raises(CameraError, match=f"camera 3 has COLMAP's model {model}, which is not"):
             load_camera(path)
 
 

@@ -213,15 +213,12 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         found |= {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
     if (K := _square(found["K"], 3)) is not None:
         found["K"] = K.tolist()
-    elif (numbers := _focal_and_centre(values)) is not None:
+    elif (numbers := _one_by_one(values)) is not None:
         found["K"] = numbers
     if (projection := _projection(values)) is not None:
         parts = _parts_of(projection)
         # Of K with a column of zeros the place is not known.
         found |= parts if projection[:, 3].any() else {"K": parts["K"]}
-    for names in _ONE_BY_ONE:
-        if found["K"] is None and None not in (numbers := [values.get(each) for each in names]):
-            found["K"] = numbers if names[0] == "fx" else _from_corner(numbers)
     models = [str(first_of(values, (word,))) for word in _MODELS]
     said = str(first_of(values, _IS_FISHEYE)).lower() not in ("none", "false", "0")
     lens, size, video = _lens(values), _said_size(values), values.get("video")
@@ -248,8 +245,11 @@ def _projection(values: Mapping[str, Any]) -> np.ndarray | None:
     return None if matrix is None else matrix[:3]
 
 
-def _focal_and_centre(values: Mapping[str, Any]) -> list[Any] | None:
-    """fx, fy, cx, cy where focal lengths and principal point stand side by side."""
+def _one_by_one(values: Mapping[str, Any]) -> list[Any] | None:
+    """fx, fy, cx, cy where each has a name, or focal lengths and principal point have."""
+    for names in _ONE_BY_ONE:
+        if None not in (numbers := [values.get(each) for each in names]):
+            return numbers if names[0] == "fx" else _from_corner(numbers)
     focal, centre = (_plain(first_of(values, _WORDS[word])) for word in ("focal", "centre"))
     if isinstance(focal, (int, float)):
         focal = [focal, focal]
@@ -336,13 +336,8 @@ def _said_size(values: Mapping[str, Any]) -> Any:
         return [int(n) if n.isdecimal() else n for n in re.split("[^0-9]+", size)]
     elif size is not None:
         return _plain(size)
-    sizes = (_size(first_of(values, (w,)), first_of(values, (h,))) for w, h in _SIDES)
-    return next((size for size in sizes if size is not None), None)
-
-
-def _size(width: Any, height: Any) -> list[Any] | None:
-    """The image size, where both of its numbers are there."""
-    return None if width is None or height is None else [width, height]
+    sizes = ([first_of(values, (side,)) for side in pair] for pair in _SIDES)
+    return next((size for size in sizes if None not in size), None)
 
 
 def _plain(value: Any) -> Any:
@@ -370,33 +365,30 @@ def _has_camera(values: object) -> bool:
     K = first_of(values, (*_WORDS["K"], "projectionparameters"))
     if isinstance(K, Mapping) and "data" not in K:
         return _has_camera(K)
-    return (
-        K is not None
-        or _projection(values) is not None
-        or _focal_and_centre(values) is not None
-        or any(set(names) <= values.keys() for names in _ONE_BY_ONE)
-    )
+    ways = (_projection(values), _one_by_one(values))
+    return K is not None or any(each is not None for each in ways)
 
 
-def _arrays_of(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Cameras that are 3 x 4 matrices by name, or whose numbers are arrays of all cameras."""
-    K = first_of(values, (*_WORDS["K"], *_PROJECTIONS))
-    if len(shape := _shape(K)) == 3:
-        count = range(shape[0])
-        names = listed(first_of(values, names_in("names cameranames cameras ids")))
-        each = [
-            {
-                word: value[i] if len(_shape(value)) > 1 and len(value) == shape[0] else value
-                for word, value in values.items()
-            }
-            for i in count
-        ]
-        return dict(zip(map(str, names if len(names) == shape[0] else count), each, strict=True))
-    if K is not None or _numbered(values):
-        return {}
-    matrices = {name: each for name, each in values.items() if _shape(each) == (3, 4)}
-    rest = {name: each for name, each in values.items() if name not in matrices}
-    return {name: {**rest, "P": each} for name, each in matrices.items()}
+def _stacked(values: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Cameras whose numbers are arrays of all of them."""
+    shape = _shape(first_of(values, (*_WORDS["K"], *_PROJECTIONS)))
+    count = shape[0] if len(shape) == 3 else 0
+    names = listed(first_of(values, names_in("names cameranames cameras ids")))
+    each = [
+        {
+            word: value[i] if len(_shape(value)) > 1 and len(value) == count else value
+            for word, value in values.items()
+        }
+        for i in range(count)
+    ]
+    return dict(zip(map(str, names if len(names) == count else range(count)), each, strict=True))
+
+
+def _matrices(values: object) -> dict[str, Mapping[str, Any]]:
+    """Cameras that are 3 x 4 matrices by name, with what stands beside them."""
+    entries = values.items() if isinstance(values, Mapping) else ()
+    rest = {name: each for name, each in entries if _shape(each) != (3, 4)}
+    return {str(name): {**rest, "P": each} for name, each in entries if name not in rest}
 
 
 def _cameras_in(values: object, depth: int = 4) -> dict[str, Mapping[str, Any]]:
@@ -456,7 +448,7 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
         raise unexpected(CameraError, path, "an object 'cameras' with one under each name", content)
     if "RadialDistortion" in content and _has_camera(content):
         return {path.stem: _matlab_entry(content)}
-    cameras = _arrays_of(content) or content.get("cameras")
+    cameras = _stacked(content) or first_of(content, ("cameras",))
     if cameras is None and (_has_camera(content) or _numbered(content)):
         return _alone(path, content)
     if isinstance(cameras, list) and all(isinstance(each, dict) for each in cameras):
@@ -465,14 +457,21 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
             raise CameraError(f"{path}: two cameras of one name among {', '.join(names)}")
         cameras = dict(zip(names, cameras, strict=True))
     # Others are not calibrated.
-    cameras = _cameras_in(content if cameras is None else cameras) or cameras
+    inside = content if cameras is None else cameras
+    cameras = _cameras_in(inside) or _matrices(inside) or cameras
     if not isinstance(cameras, dict):
         known = "'names' (EasyMocap), camera_matrix (OpenCV, ROS), cam0 (Kalibr) or cameras by name"
         raise unexpected(CameraError, path, known, list(content))
     for name, values in cameras.items():
         if not isinstance(values, Mapping):
             raise unexpected(CameraError, f"{path}: camera {name!r}", "an object", values)
-    return {str(n): _entry(each, content.get("units", units)) for n, each in cameras.items()}
+    said = first_of(content, ("units", "unit"))
+    return {
+        str(name): _matlab_entry(each)
+        if "RadialDistortion" in each
+        else _entry(each, units if said is None else said)
+        for name, each in cameras.items()
+    }
 
 
 def _read_toml(path: Path) -> dict[str, Entry]:
@@ -571,6 +570,11 @@ def _read_binary(path: Path) -> dict[str, Entry]:
         (count,) = struct.unpack_from("<Q", data)
         for _ in range(count):
             number, model, *size = struct.unpack_from("<iiQQ", data, at)
+            if not 0 <= model < len(_COLMAP_MODELS):
+                raise CameraError(
+                    f"{path}: camera {number} has COLMAP's model {model}, which is not read; "
+                    "undistort the pictures by colmap image_undistorter"
+                )
             name, length = _COLMAP_MODELS[model]
             values = struct.unpack_from(f"<{length}d", data, at + 24)
             words = [str(number), name, *map(str, size), *map(repr, values)]
@@ -598,12 +602,8 @@ def _kalibr(path: Path, chain: Mapping[str, Mapping[str, Any]]) -> dict[str, Ent
         entry = _entry(values)
         step = values.get("T_cn_cnm1")
         if len(chain) > 1 and (step is not None or not entries):
-            try:
+            with refusing(CameraError, f"{path}: {name}: T_cn_cnm1: not 4 rows of 4 numbers"):
                 pose = np.asarray(step, float) @ pose if step is not None else pose
-            except (ValueError, TypeError) as error:
-                raise unexpected(
-                    CameraError, f"{path}: {name}: T_cn_cnm1", "4 rows of 4 numbers", step
-                ) from error
             entry = entry._replace(rotation=pose[:3, :3].tolist(), translation=pose[:3, 3].tolist())
         entries[name] = entry
     return entries
