@@ -161,6 +161,14 @@ def test_a_skeleton_without_motion(tmp_path: Path, motion: str) -> None:
         read_motion_capture(path)
 
 
+def test_a_bvh_of_two_people_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.bvh"
+    one = bvh(motion="").partition("\n")[2]
+    path.write_text(f"HIERARCHY\n{one}{one.replace('Hips', 'Other')}MOTION\n")
+    with pytest.raises(BodyError, match="a second ROOT; save every skeleton"):
+        load_body(path)
+
+
 def test_a_bvh_with_decimal_commas(tmp_path: Path) -> None:
     rows = "MOTION\nFrames: 2\nFrame Time: 0.0333333\n{rows}\n{rows}\n"
     path = tmp_path / "a.bvh"

@@ -165,7 +165,11 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
         line = words.line
         if allowed == ("MOTION",) and words.at_end:
             return segments, np.zeros((0, len(columns))), 30.0
-        kind = words.keyword(*allowed)
+        kind = words.keyword(*allowed, *(("ROOT",) if segments else ()))
+        if kind == "ROOT" and segments:
+            raise MotionCaptureError(
+                f"{path}: line {line}: a second ROOT; save every skeleton in a file of its own"
+            )
         if kind == "MOTION":
             break
         if kind == "}":
