@@ -1460,3 +1460,21 @@ def test_arrays_as_ultralytics_calls_them(tmp_path: Path) -> None:
     stack = np.stack([person(t) for t in T])
     np.savez(tmp_path / "a.npz", xy=stack[..., :2], conf=stack[..., 2], names=np.array(TFJS))
     check(read(tmp_path / "a.npz"))
+
+
+def test_joints_in_capitals(tmp_path: Path) -> None:
+    entries = [{"Frame": t, "Joints": [{"Name": n, "X": x, "Y": y, "Confidence": c}
+                for n, (x, y, c) in zip(TFJS, person(t), strict=True)]} for t in T]  # fmt: skip
+    check(read(write(tmp_path / "a.json", entries)))
+
+
+@pytest.mark.parametrize("around", ["results", "pictures"])
+def test_the_size_that_a_frame_says(tmp_path: Path, around: str) -> None:
+    frames = [{"people": [{"keypoints": (person(t) * (0.5, 0.5, 1)).tolist()}],
+               "canvas_width": 320, "canvas_height": 240} for t in T]  # fmt: skip
+    content = {"fps": 25, "results": frames}
+    if around == "pictures":
+        content = {f"{t}.jpg": frame for t, frame in enumerate(frames)}
+    found = read(write(tmp_path / "a.json", content))
+    check(found)
+    assert any("scaled from images of 320 x 240" in line for line in found.report)

@@ -126,7 +126,7 @@ def read_content(path: Path, content: Any, image_size_wh: Size, num_frames: int 
     in_order = isinstance(frames, list)
     found, own = united(dict(enumerate(frames)) if in_order else frames)
     people = _people(name, found, own or _said_names(content, found), in_order=in_order)
-    return people._replace(first=1 if from_one else None, size_wh=said_size(content))
+    return people._replace(first=1 if from_one else None, size_wh=_size(content))
 
 
 def read_folder(path: Path) -> People:
@@ -234,10 +234,7 @@ def _said_names(content: object, frames: Frames) -> Names | None:
 def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Person]] | Frames:
     """The people of every frame, by what the file says of it, or in order."""
     if isinstance(content, dict):
-        inner = next(
-            (content[k] for k in _FRAMES if isinstance(content.get(k), (list, dict))), None
-        )
-        if inner is not None:
+        if (inner := _frames_in(content)) is not None:
             return _frames(path, inner, num_frames)
         inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
@@ -315,6 +312,19 @@ def _key_of(where: str, entry: object) -> Key | None:
     codes = {k: code for k, text in texts.items() if (code := seconds_in(text)) is not None}
     time = first_of({**counts, **codes}, tuple(TIMES))
     return float(time) if time is not None else first_of(texts, PICTURES)
+
+
+def _frames_in(content: Mapping[str, Any]) -> list[Any] | dict[str, Any] | None:
+    """What a file has under a word for frames; None: it has no such word."""
+    return next((content[k] for k in _FRAMES if isinstance(content.get(k), (list, dict))), None)
+
+
+def _size(content: Any) -> tuple[float, float] | None:
+    """The size of the images that the file or its first frame names."""
+    inner = _frames_in(content) if isinstance(content, dict) else None
+    inner = content if inner is None else inner
+    frames = [*inner.values()] if isinstance(inner, dict) else inner
+    return said_size(content) or said_size(frames)
 
 
 def _read_vitpose(path: Path, content: Mapping[str, Any]) -> People:

@@ -45,6 +45,7 @@ JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
     "pose kps"
 )
+_XY = {"x", "y"}
 _HEADS = names_in("meta_info metadata meta info header video video_info image")
 
 
@@ -133,7 +134,7 @@ def is_joints(value: list[Any]) -> bool:
         key = key_of(first, JOINTS)  # of a person, who may have a box with x and y
         if key is not None and isinstance(first[key], (list, dict)):
             return False
-        return {"x", "y"} <= first.keys() or "position" in first
+        return {*map(plain_word, first)} >= _XY or "position" in first
     return (
         isinstance(first, list) and 2 <= len(first) <= 4 and not isinstance(first[0], (list, dict))
     )
@@ -231,10 +232,11 @@ def _row(where: str, row: Any) -> list[float]:
         return [np.nan] * 3
     if isinstance(row, dict):
         place = row.get("position", row)
-        if not isinstance(place, dict) or not {"x", "y"} <= place.keys():
+        if not isinstance(place, dict) or not {*map(plain_word, place)} >= _XY:
             raise unexpected(KeypointError, where, "x, y and visibility", row)
         given = first_of(row, CONFIDENCES)
-        row = [place["x"], place["y"], float(given) if isinstance(given, bool) else given]
+        x, y = (first_of(place, (axis,)) for axis in "xy")
+        row = [x, y, float(given) if isinstance(given, bool) else given]
     elif isinstance(row, list) and len(row) == 4:
         row = [row[0], row[1], row[3]]  # x, y, z, visibility
     values = number_array(row, where)
