@@ -1371,7 +1371,7 @@ def test_people_by_name_in_frames(tmp_path: Path) -> None:
 def test_arrays_of_several_cameras_are_told(tmp_path: Path) -> None:
     stack = np.stack([person(t)[:, :2] for t in T])
     np.save(tmp_path / "a.npy", np.stack([stack, stack + 5, stack - 5]))
-    with pytest.raises(KeypointError, match="arrays of 3 cameras with 6 frames each"):
+    with pytest.raises(KeypointError, match="3 cameras or people with 6 frames each"):
         read(tmp_path / "a.npy")
 
 
@@ -1478,3 +1478,16 @@ def test_the_size_that_a_frame_says(tmp_path: Path, around: str) -> None:
     found = read(write(tmp_path / "a.json", content))
     check(found)
     assert any("scaled from images of 320 x 240" in line for line in found.report)
+
+
+def test_entries_of_several_videos_are_no_people(tmp_path: Path) -> None:
+    heading, *rows = headed({f"{t},a.mp4": person(t) for t in T}, "frame,video").split("\n")
+    path = write(tmp_path / "a.csv", "\n".join([heading, *rows]))
+    check(read(path))
+    rows += headed({f"{t},b.mp4": other(t) for t in T}).split("\n")[1:]
+    with pytest.raises(KeypointError, match=r"entries of 2 videos, 'a\.mp4, b\.mp4'; expected"):
+        read(write(path, "\n".join([heading, *rows])))
+    entries = [{"camera": c, "frame": t, "joints": person(t).tolist()} for t in T for c in (0, 1)]
+    with pytest.raises(KeypointError, match="entries of 2 videos, '0, 1'"):
+        read(write(tmp_path / "a.json", entries))
+    check(read(write(tmp_path / "a.json", entries[::2])))

@@ -9,9 +9,9 @@ Call `in_order`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,6 +91,17 @@ def files_of(folder: Path, suffix: str) -> list[Path]:
     """The files of a kind in order; those that begin with a dot are the system's."""
     named = (entry for entry in folder.iterdir() if not entry.name.startswith("."))
     return sorted(entry for entry in named if entry.suffix.lower() == suffix)
+
+
+def check_one_video(names: Collection[Any]) -> None:
+    """Refuse entries of several videos.
+
+    Raises:
+        KeypointError: If there is more than one name.
+    """
+    if len(names) > 1:
+        videos = shortened(", ".join(sorted(map(str, names))))
+        raise KeypointError(f"entries of {len(names)} videos, {videos}; expected those of one")
 
 
 def in_seconds(time: str, frames: Frames) -> Frames:

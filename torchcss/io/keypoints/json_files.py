@@ -25,7 +25,7 @@ from torchcss.io.keypoints import annotated
 from torchcss.io.keypoints.arrays import is_movenet, read_arrays
 from torchcss.io.keypoints.clicked import is_clicked, read_clicked
 from torchcss.io.keypoints.coco import read_coco
-from torchcss.io.keypoints.frames import files_of, in_seconds, plain_name
+from torchcss.io.keypoints.frames import check_one_video, files_of, in_seconds, plain_name
 from torchcss.io.keypoints.json_people import (
     JOINTS,
     PEOPLE,
@@ -57,6 +57,7 @@ from torchcss.io.keypoints.words import (
     ORDER_NAMES,
     PICTURES,
     TIMES,
+    VIDEOS,
     first_of,
     seconds_in,
     time_word,
@@ -250,6 +251,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
             f"{path}: not a keypoint file; expected what a detector writes (docs/guide.md lists "
             f"the formats), found {shortened(content)}"
         )
+    videos = [first_of(entry, VIDEOS) for entry in content if isinstance(entry, dict)]
+    check_one_video({video for video in videos if isinstance(video, (str, int))})
     keys = [_key_of(f"{path}: detection {i}", entry) for i, entry in enumerate(content)]
     if len(set(keys)) == 1 < len(keys) == num_frames:  # such as the name of the video
         keys = [None] * len(keys)

@@ -104,7 +104,7 @@ _LARGEST_FRACTION = 3.0
 """Landmarks that MediaPipe guesses outside the image stay within this many of its sides."""
 
 _PERCENT = 50.0
-"""Confidences that run to more than this, and to 100 at most, are percent."""
+"""Confidences that run to more than this, to 100 at most, and mostly above 1, are percent."""
 
 _OUTSIDE = 3.0
 """How many times the longer image side a joint may lie outside before the file is refused."""
@@ -314,8 +314,8 @@ def _check_counts(
     if film.num_frames is not None and len(frames) != film.num_frames:
         if {len(frame) for frame in frames} == {film.num_frames}:
             raise KeypointError(
-                f"arrays of {len(frames)} cameras with {film.num_frames} frames each, it seems; "
-                "save those of this camera alone"
+                f"{len(frames)} cameras or people with {film.num_frames} frames each, it seems; "
+                "expected frames first, of this camera alone"
             )
         raise wrong_count(film.num_frames, len(frames))
     if not 0 <= first_frame < max(1, len(frames)):
@@ -341,7 +341,7 @@ def _checked_numbers(
     if most == 2.0 and {*counts.tolist()} <= {0.0, 1.0, 2.0}:  # not labelled, hidden, seen
         report.append("visibility 0, 1, 2 taken as confidence 0, 0.5, 1")
         frames = [frame * (1.0, 1.0, 0.5) for frame in frames]
-    elif _PERCENT < most <= 100.0 and not (counts < 0.0).any():
+    elif _PERCENT < most <= 100.0 and np.median(counts[counts > 0.0]) > 1.0:
         report.append(f"confidences run to {most:g}: they are taken for percent")
         frames = [frame * (1.0, 1.0, 0.01) for frame in frames]
     for index, frame in enumerate(frames):

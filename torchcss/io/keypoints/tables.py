@@ -35,7 +35,7 @@ from torchcss.errors import KeypointError
 from torchcss.files import read_text, refusing, shortened, unexpected
 from torchcss.io.keypoints import words
 from torchcss.io.keypoints.annotated import VIA_SHAPE, read_via_table
-from torchcss.io.keypoints.frames import in_seconds
+from torchcss.io.keypoints.frames import check_one_video, in_seconds
 from torchcss.io.keypoints.json_people import JOINTS
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import Frames, Key, People, Person, joint_counts, screened
@@ -103,6 +103,9 @@ def people_of_rows(rows: list[Row]) -> People:
     if VIA_SHAPE in heading:
         return read_via_table(heading, rows[1:])
     columns = _headed(heading)
+    video = words.first_of({cell: n for n, cell in enumerate(heading)}, words.VIDEOS)
+    if video is not None:
+        check_one_video({"".join(row[video : video + 1]) for _, row in rows[1:]} - {""})
     if columns.time is not None and columns.frame is not None:
         first = rows[1][1][columns.frame : columns.frame + 1]
         if first and words.seconds_in(first[0]) is not None:

@@ -44,6 +44,12 @@ TRACKS = names_in(
 )
 """That by which a person is known again in another frame."""
 
+VIDEOS = names_in(
+    "video videoname videoid videopath videofile clip clipname sequence camera cameraid cameraname "
+    "cam camid view"
+)
+"""Which of several videos an entry belongs to."""
+
 CONFIDENCES = names_in(
     "confidence conf confidencescore c score s keypointscore kptscore likelihood p prob "
     "probability certainty visibility visible vis v presence inframelikelihood"
