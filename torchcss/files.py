@@ -22,6 +22,8 @@ from torchcss.errors import OutputError, TorchcssError
 StrPath = str | os.PathLike[str]
 """A path in any form."""
 
+_PICKLED = "it holds pickled objects, which could run a programme; save plain arrays"
+
 _ROWS = 64
 """Rows of an array that are copied at a time."""
 
@@ -397,11 +399,8 @@ def load_arrays(
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged archives
-        reason = (
-            "it holds pickled objects, which could run a programme; save plain arrays"
-            if "pickle" in str(error)
-            else f"{one_line(error)}; get a complete copy"
-        )
+        advice = "" if str(error) == _PICKLED else "; get a complete copy"
+        reason = f"{one_line(error)}{advice}"
         raise error_class(f"{path}: cannot be read as an NPZ file: {reason}") from error
 
 
@@ -434,11 +433,13 @@ def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype] | None:
 
 
 def _check_header(stream: IO[bytes], size: int) -> None:
-    """Refuse an array whose heading says more numbers than there are bytes."""
+    """Refuse an array of objects, or whose heading says more numbers than there are bytes."""
     header = array_header(stream)
     if header is None:
         return  # NumPy says what is wrong
     shape, dtype = header
+    if dtype.hasobject:
+        raise ValueError(_PICKLED)
     if math.prod(shape) * max(dtype.itemsize, 1) > size:
         raise ValueError(f"its heading says {list(shape)} of {dtype}, which is more than it holds")
 

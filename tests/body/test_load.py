@@ -628,6 +628,8 @@ def test_collada_says_its_unit_and_where_a_mesh_stands(tmp_path: Path) -> None:
     np.testing.assert_allclose(body.part_shape[part, :3], [0.03, 0.05, 0.2], atol=1e-12)
     np.testing.assert_allclose(body.part_translation[part], [0.4, 0, 0], atol=1e-12)
     np.testing.assert_allclose(body.part_rotation[part].abs()[:, 2], [1, 0, 0], atol=1e-12)
+    (tmp_path / "a.dae").write_text(COLLADA.replace("instance_geometry", "instance_node"))
+    assert "places a node by reference" in load_body(tmp_path / "arm.urdf").notes[1]
     for spoilt in ("40<", "#g", "</node>", "200 0 0", "0.001"):
         (tmp_path / "a.dae").write_text(COLLADA.replace(spoilt, "x"))
         assert any("a.dae: not COLLADA" in note for note in load_body(tmp_path / "arm.urdf").notes)

@@ -412,12 +412,23 @@ def test_sizes_by_any_usual_name(tmp_path: Path, size: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "model",
     [{"model": "fisheye"}, {"camera_model": "OPENCV_FISHEYE"}, {"distortion_type": "KannalaBrandt"},
-     {"camera_model": "omni", "distortion_model": "radtan"}, {"fisheye_model": 1}],
+     {"camera_model": "omni", "distortion_model": "radtan"}, {"fisheye_model": 1}, {"xi": 1.2},
+     {"MappingCoefficients": [8e2, -1e-3, 1e-7, 1e-10]}],
 )  # fmt: skip
 def test_fisheye_by_any_usual_name(tmp_path: Path, model: dict[str, Any]) -> None:
     content = {"K": K, "D": LENS[:4], "width": 640, "height": 480, **model}
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(CameraError, match="fisheye"):
+        load_camera(tmp_path / "a.json")
+
+
+def test_an_inverse_model_is_refused_unless_it_is_none(tmp_path: Path) -> None:
+    content = {"fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "width": 640, "height": 480,
+               "model": "distortion.inverse_brown_conrady", "coeffs": [0, 0, 0, 0, 0]}  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    check(tmp_path / "a.json", [0.0] * 5)
+    (tmp_path / "a.json").write_text(json.dumps({**content, "coeffs": LENS}))
+    with pytest.raises(CameraError, match="an inverse model of a lens is not supported"):
         load_camera(tmp_path / "a.json")
 
 

@@ -116,8 +116,12 @@ def test_pickles_that_ask_for_room(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("read", [keypoints, load_track, load_camera])
 def test_pickles_in_arrays(tmp_path: Path, read: Callable[[Path], object]) -> None:
-    np.savez(tmp_path / "a.npz", keypoints=np.array([{1: 2}], dtype=object))
+    values = np.array([{1: 2}], dtype=object)
+    np.savez(tmp_path / "a.npz", keypoints=values)
     assert "pickled" in refused(read, tmp_path / "a.npz")
+    if read is not load_track:
+        np.save(tmp_path / "a.npy", values)
+        assert "pickled" in refused(read, tmp_path / "a.npy")
 
 
 class Runs:

@@ -70,7 +70,7 @@ class Entry(NamedTuple):
         translation: World to camera.
         units: Unit of the world and of pixels.
         video: Name of the video.
-        fisheye: Whether the lens is one that is not supported.
+        fisheye: Whether the lens is one that is not supported; "inverse": its model is inverse.
         note: What was assumed, for the user.
         name: What the camera calls itself.
     """
@@ -121,14 +121,17 @@ _SHAPES = ("img_shape", "image_shape", "ImageSize", "shape")
 _SIDES = (*SIDES, ("w", "h"), ("imgw", "imgh"), ("resw", "resh"), ("cols", "rows"), ("nx", "ny"))
 _NAMES = names_in("name cameraname cameraid camid id serial serialnumber")
 _MODELS = names_in(
-    "distortionmodel cameramodel model cameratype distortiontype lensmodel lens lenstype "
+    "distortionmodel cameramodel modeltype model cameratype distortiontype lensmodel lens lenstype "
     "projection type"
 )
-_IS_FISHEYE = names_in("fisheye isfisheye usefisheye fisheyemodel")
+_IS_FISHEYE = names_in("fisheye isfisheye usefisheye fisheyemodel mappingcoefficients xi")
 _FISHEYE = re.compile("equidist|fish_?eye|kannala|omni|eucm|fov|^ds$|^ds-|-ds$", re.IGNORECASE)
 
 _ROUNDING = 1e-3
 """Skew that is taken for rounding, in focal lengths."""
+
+_INVERSE = re.compile("inverse", re.IGNORECASE)
+"""RealSense's model whose coefficients undo the distortion."""
 
 _FISHEYE_NUMBERS = re.compile("fish_?eye_?(param|model|coeff)", re.IGNORECASE)
 
@@ -220,8 +223,10 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         # Of K with a column of zeros the place is not known.
         found |= parts if projection[:, 3].any() else {"K": parts["K"]}
     models = [str(first_of(values, (word,))) for word in _MODELS]
-    said = str(first_of(values, _IS_FISHEYE)).lower() not in ("none", "false", "0")
+    said = str(first_of(values, _IS_FISHEYE)).lower() not in ("none", "false", "0", "0.0")
     lens, size, video = _lens(values), _said_size(values), values.get("video")
+    if any(map(_INVERSE.search, models)) and np.any(np.array(lens, dtype=object)):
+        said = "inverse"
     notes = []
     if turned := first_of(values, ("rotationcount",)):  # Caliscope's
         notes.append(
@@ -365,7 +370,7 @@ def _has_camera(values: object) -> bool:
     K = first_of(values, (*_WORDS["K"], "projectionparameters"))
     if isinstance(K, Mapping) and "data" not in K:
         return _has_camera(K)
-    ways = (_projection(values), _one_by_one(values))
+    ways = (_projection(values), _one_by_one(values), first_of(values, ("mappingcoefficients",)))
     return K is not None or any(each is not None for each in ways)
 
 
@@ -668,6 +673,8 @@ def _check_matlab_size(path: Path) -> None:
 
 def _matlab_entry(values: Mapping[str, Any]) -> Entry:
     found = _entry(values)
+    if found.fisheye:
+        return found
     with refusing(CameraError, "expected cameraParams"):
         K = real_numbers(found.K, "K", CameraError)
         K = K - (0, 0, 1, 1) if K.shape == (4,) else K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]

@@ -102,9 +102,10 @@ def load_camera(
     name = _choose(path, entries, name, None if video is None else Path(video))
     entry, where = entries[name], f"{path}: camera {name!r}"
     if entry.fisheye:
+        what = "an inverse model of a" if entry.fisheye == "inverse" else "a fisheye"
         raise CameraError(
-            f"{where}: a fisheye lens is not supported; undistort the video first and give the "
-            "camera of the undistorted images"
+            f"{where}: {what} lens is not supported; undistort the video first and give the camera "
+            "of the undistorted images"
         )
     if entry.image_size_wh is None and video is not None and Path(video).exists():
         info = VideoReader(video).info

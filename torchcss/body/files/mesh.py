@@ -112,5 +112,7 @@ def _placed(
             pose = pose @ own
         elif step.tag == "instance_geometry":
             yield meshes[step.get("url", "")] @ pose[:3, :3].T + pose[:3, 3]
+        elif step.tag == "instance_node":
+            raise ValueError("it places a node by reference, which is not read; save it as STL")
         elif step.tag == "node":
             yield from _placed(step, pose, meshes)

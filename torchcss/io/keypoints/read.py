@@ -337,7 +337,8 @@ def _checked_numbers(
     """Refuse numbers that are not finite where they count; bring confidences into their range."""
     checked, clipped = [], 0
     counts = np.concatenate([np.zeros(0), *(frame[..., 2].ravel() for frame in frames)])
-    most = float(np.max(counts, initial=0.0, where=np.isfinite(counts)))
+    counts = counts[np.isfinite(counts)]
+    most = float(np.max(counts, initial=0.0))
     if most == 2.0 and {*counts.tolist()} <= {0.0, 1.0, 2.0}:  # not labelled, hidden, seen
         report.append("visibility 0, 1, 2 taken as confidence 0, 0.5, 1")
         frames = [frame * (1.0, 1.0, 0.5) for frame in frames]
