@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -289,6 +290,10 @@ def test_caliscope_leaves_out_what_is_not_calibrated(tmp_path: Path) -> None:
     assert load_camera(path, "cam_0").metric
     path.write_text(camera + camera.replace("cameras.0", "cameras.1"))
     assert load_camera(path, video=tmp_path / "cam_1.mp4").camera.name == "1"
+    for word in ("rotation", "translation"):
+        camera = re.sub(f"(?m)^{word} = .*", f'{word} = "null"', camera)
+    path.write_text(camera)
+    assert "no extrinsics" in str(load_camera(path).units_note)
 
 
 def test_easymocap_names_stay_text(tmp_path: Path) -> None:

@@ -206,6 +206,7 @@ def _read_folder(path: Path) -> dict[str, Entry]:
 
 def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     """A camera of a mapping, by whatever words it uses."""
+    values = {key: None if each == "null" else each for key, each in values.items()}
     for words in (("intrinsics", "intrinsic", "projectionparameters"), ("extrinsics", "extrinsic")):
         inner = first_of(values, words)
         if isinstance(inner, Mapping) and "data" not in inner:  # a mapping of its own

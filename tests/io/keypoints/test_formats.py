@@ -220,6 +220,9 @@ def test_deeplabcut(tmp_path: Path) -> None:
     found = read(path)
     assert found.confidence[0].tolist() == [1.0] * 5
     assert found.confidence[2].tolist() == [1.0, 0.0, 1.0, 1.0, 1.0]
+    path.write_text(path.read_text().replace("coords,x,y,x,y", "coords,x,y,z,y"))
+    with pytest.raises(KeypointError, match="x, y, z are points in space"):
+        read(path)
 
 
 def test_deeplabcut_with_several_animals(tmp_path: Path) -> None:

@@ -1491,3 +1491,29 @@ def test_entries_of_several_videos_are_no_people(tmp_path: Path) -> None:
     with pytest.raises(KeypointError, match="entries of 2 videos, '0, 1'"):
         read(write(tmp_path / "a.json", entries))
     check(read(write(tmp_path / "a.json", entries[::2])))
+
+
+def test_points_of_caliscope(tmp_path: Path) -> None:
+    heading = (
+        "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
+    )
+    names = ALIASES["MediaPipe-33"]
+    rows = [f"{t},{port},{t},{4e4 + t / 25},{n},{x:.0f},{y:.0f},,"
+            for t in SEEN for port in (0, 1)
+            for n, (x, y, _) in [*enumerate(person(t, names)), (105, (9, 9, 1))]]  # fmt: skip
+    with pytest.raises(KeypointError, match="entries of 2 videos, '0, 1'"):
+        read(write(tmp_path / "a.csv", "\n".join([heading, *rows])))
+    rows = [row for row in rows if row.split(",")[1] == "1"]
+    found = read(write(tmp_path / "a.csv", "\n".join([heading, *rows])))
+    check(found, (3,))
+    assert "points numbered from 100 on, of hands and face, are left out" in found.report
+
+
+def test_players_with_what_is_visible_beside(tmp_path: Path) -> None:
+    entries = [{"frame_idx": t, "width": 640, "height": 480, "players": [
+        {"identity": who, "keypoints_xy": of[:, :2].tolist(), "keypoints_visible": [1] * 16 + [0]}
+        for who, of in (("lower", other(t)), ("upper", person(t)))]} for t in T]  # fmt: skip
+    found = read(write(tmp_path / "a.json", entries))
+    check(found, names=LIMBS[:3])
+    assert any("'upper' of the file" in line for line in found.report)
+    assert found.confidence[0, found.names.index("r_ankle")] == 0

@@ -39,11 +39,11 @@ from torchcss.io.keypoints.words import (
 from torchcss.joint_names import names_in
 
 PEOPLE = names_in(
-    "people bodies instances instanceinfo predictions annots poses persons detections"
+    "people bodies instances instanceinfo predictions annots poses persons players detections"
 )
 JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
-    "pose kps"
+    "pose kps keypointsxy keypoints2d joints2d"
 )
 _XY = {"x", "y"}
 _HEADS = names_in("meta_info metadata meta info header video video_info image")

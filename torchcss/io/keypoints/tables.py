@@ -49,7 +49,8 @@ _PARTS = {
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
-_UNITS = frozenset(names_in("px pixel pixels pos position coord 2d"))
+_UNITS = frozenset(names_in("px pixel pixels pos position coord loc img 2d"))
+_IN_SPACE = frozenset(names_in("obj world 3d"))
 _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)(_|(?=[0-9])))+"
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
@@ -122,6 +123,7 @@ def people_of_rows(rows: list[Row]) -> People:
     joints, frames = _read_rows(columns, rows[1:])
     if columns.time is not None:
         frames = in_seconds(columns.time, frames)
+    frames, joints = _without_hands(frames, joints, report)
     frames, names = reordered(frames, joints)
     in_order = columns.frame is None and columns.joint is None
     people = list(frames.values()) if in_order else frames
@@ -131,6 +133,20 @@ def people_of_rows(rows: list[Row]) -> People:
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
     return People(people, names, report, first=first, by_hand=heading == [*_HAND])
+
+
+def _without_hands(
+    frames: Frames, joints: list[str], report: list[str]
+) -> tuple[Frames, list[str]]:
+    """The same without what Caliscope numbers from 100 on beside MediaPipe's landmarks."""
+    is_body = [name.isdecimal() and int(name) < NUM_LANDMARKS for name in joints]
+    others = [name for name, own in zip(joints, is_body, strict=True) if not own]
+    if not any(is_body) or not others or not all(re.fullmatch("[1-9][0-9]{2}", n) for n in others):
+        return frames, joints
+    report.append("points numbered from 100 on, of hands and face, are left out")
+    for people in frames.values():
+        people[:] = [person._replace(joints=person.joints[is_body]) for person in people]
+    return frames, [name for name, own in zip(joints, is_body, strict=True) if own]
 
 
 def _told(columns: _Columns, heading: Sequence[str]) -> list[str]:
@@ -331,6 +347,8 @@ def _headed(heading: Sequence[str]) -> _Columns:
 def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int] | None:
     """Joint and kind of number of a column, whichever comes first in its name."""
     parted = [word for word in re.split(r"[\W_]+", re.sub(CASE, " ", cell).lower()) if word]
+    if not _IN_SPACE.isdisjoint(parted):
+        return None
     parted = [word for word in parted if word not in _UNITS]
     if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", "_".join(parted)):  # x1, v33
         return (match[2], kinds[match[1]]) if match[1] in kinds else None
@@ -346,6 +364,8 @@ def _deeplabcut(rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]
     """The columns of DeepLabCut's headings, the rows below, and what to report."""
     headings = {row[0].lower(): row for _, row in rows[:4]}
     coords, joints = headings["coords"], headings["bodyparts"]
+    if "z" in coords:
+        raise KeypointError("coords: x, y, z are points in space; expected a camera's pixels")
     kinds = ("x", "y", "likelihood")
     start = next((index for index, cell in enumerate(joints) if index and cell), None)
     size = len(coords)

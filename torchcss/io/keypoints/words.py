@@ -40,13 +40,13 @@ PICTURES = names_in(
 TRACKS = names_in(
     "trackid track trackname tracking trackingid idx personid person personidx personname "
     "individual individuals instanceid instance objectid subjectid subject playerid player person "
-    "pid tid id"
+    "identity pid tid id"
 )
 """That by which a person is known again in another frame."""
 
 VIDEOS = names_in(
     "video videoname videoid videopath videofile clip clipname sequence camera cameraid cameraname "
-    "cam camid view"
+    "cam camid view port"
 )
 """Which of several videos an entry belongs to."""
 
@@ -57,7 +57,8 @@ CONFIDENCES = names_in(
 """The confidence of a joint, the best first where there are several."""
 
 JOINT_WORDS = (
-    *(f"{of}{what}" for of in names_in("landmark joint keypoint kpt bodypart part node marker")
+    *(f"{of}{what}"
+      for of in names_in("landmark joint keypoint kpt bodypart part node marker point")
       for what in ("", "name", "id", "index", "idx", "type")),
     *names_in("name label class classname id index idx classid type"),
 )  # fmt: skip
@@ -65,7 +66,8 @@ JOINT_WORDS = (
 
 SCORES = (
     *names_in("keypointscores keypointsscores scores confidences keypointsconf keypointconfidences "
-              "keypointsconfidence keypointconfidence keypointscore likelihoods"),
+              "keypointsconfidence keypointconfidence keypointscore likelihoods keypointsvisible "
+              "keypointsvisibility"),
     *CONFIDENCES,
 )  # fmt: skip
 """The confidences of all joints together."""
