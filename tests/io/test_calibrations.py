@@ -418,6 +418,7 @@ def test_sizes_by_any_usual_name(tmp_path: Path, size: dict[str, Any]) -> None:
     "model",
     [{"model": "fisheye"}, {"camera_model": "OPENCV_FISHEYE"}, {"distortion_type": "KannalaBrandt"},
      {"camera_model": "omni", "distortion_model": "radtan"}, {"fisheye_model": 1}, {"xi": 1.2},
+     {"distortion": {"model": "fisheye", "coefficients": [0.1, 0, 0, 0]}, "D": None},
      {"MappingCoefficients": [8e2, -1e-3, 1e-7, 1e-10]}],
 )  # fmt: skip
 def test_fisheye_by_any_usual_name(tmp_path: Path, model: dict[str, Any]) -> None:
@@ -608,7 +609,9 @@ def test_a_folder_of_a_file_for_each_camera(tmp_path: Path) -> None:
     assert list(read_entries(tmp_path)) == ["narrow_stereo", "right/narrow_stereo"]
 
 
-@pytest.mark.parametrize("form", ["words", "Human3.6M", "VideoPose3D", "order", "by name"])
+@pytest.mark.parametrize(
+    "form", ["words", "Human3.6M", "VideoPose3D", "order", "by name", "objects", "data", "told"]
+)
 def test_coefficients_in_other_orders(tmp_path: Path, form: str) -> None:
     k1, k2, p1, p2, k3 = LENS
     parts = {"radial_distortion": [k1, k2, k3], "tangential_distortion": [p1, p2]}
@@ -620,10 +623,25 @@ def test_coefficients_in_other_orders(tmp_path: Path, form: str) -> None:
                         "res_h": 480},
         "order": {"K": K, "distortion_order": ["k1", "k2", "k3", "p1", "p2"],
                   "distortion": [k1, k2, k3, p1, p2], **size},
+        "objects": {"camera_matrix": {"fx": FX, "fy": FY, "cx": CX, "cy": CY}, "image_size": size,
+                    "distortion": {"model": "brown-conrady", "coefficients": LENS},
+                    "board": {"rows": 5, "cols": 8}},
+        "data": {"camera_matrix": {"data": np.ravel(K).tolist()}, **size,
+                 "distortion_coefficients": {"data": LENS}},
+        "told": {"distortion_direction": "from rays to pixels", "distortion_model": "plumb_bob",
+                 "camera_matrix": K, "distortion_coefficients": LENS, **size},
         "by name": {"K": K, "dist": {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}, **size},
     }[form]  # fmt: skip
     (tmp_path / "a.json").write_text(json.dumps(content))
     check(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("lens", [{"rows": 1, "cols": 5, "data": LENS[:4]}, "0.1, 0.2", "[1 2]"])
+def test_coefficients_that_are_none_are_not_passed_over(tmp_path: Path, lens: Any) -> None:
+    content = {"camera_matrix": K, "dist": lens, "width": 640, "height": 480}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(CameraError, match="distortion: expected numbers"):
+        load_camera(tmp_path / "a.json")
 
 
 def test_metashape_counts_from_the_middle(tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ _PROJECTIONS = names_in("p projectionmatrix pmatrix projmat projection proj")
 _POSES = names_in("extrinsic extrinsics extrinsicmatrix extrinsicsmatrix rt w2c worldtocamera")
 """What all numbers together are called, and rotation and translation."""
 
-_DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs|dvec)$")
+_DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs|coefficients|dvec)$")
 """How the name of a lens's coefficients begins, or all of it."""
 
 _ONE_BY_ONE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
@@ -207,11 +207,9 @@ def _read_folder(path: Path) -> dict[str, Entry]:
 def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     """A camera of a mapping, by whatever words it uses."""
     values = {key: None if each == "null" else each for key, each in values.items()}
-    for words in (("intrinsics", "intrinsic", "projectionparameters"), ("extrinsics", "extrinsic")):
-        inner = first_of(values, words)
-        if isinstance(inner, Mapping) and "data" not in inner:  # a mapping of its own
-            rest = {key: each for key, each in values.items() if plain_word(key) not in words}
-            values = {**rest, **inner}
+    inner = [word for word, each in values.items() if _is_inner(word, each)]
+    for word in inner:  # a mapping of its own
+        values = {**{key: each for key, each in values.items() if key != word}, **values[word]}
     found = {n: _plain(first_of(values, _WORDS[n])) for n in ("K", "rotation", "translation")}
     if found["rotation"] is None and (pose := _square(first_of(values, _POSES), 4)) is not None:
         found |= {"rotation": pose[:3, :3].tolist(), "translation": pose[:3, 3].tolist()}
@@ -244,6 +242,14 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
                  note="; ".join(notes) or None)  # fmt: skip
 
 
+def _is_inner(word: str, value: Any) -> bool:
+    """Whether intrinsics, extrinsics or coefficients are objects of their own."""
+    plain = plain_word(word)
+    words = (*_WORDS["K"], *_POSES, "projectionparameters")
+    named = plain in words or bool(_DISTORTION.match(plain))
+    return named and isinstance(value, Mapping) and "data" not in value
+
+
 def _projection(values: Mapping[str, Any]) -> np.ndarray | None:
     """The 3 x 4 matrix that projects points of the world; None: there is none, or K beside it."""
     given = first_of(values, _WORDS["K"])
@@ -268,16 +274,14 @@ def _lens(values: Mapping[str, Any]) -> Any:
     lenses = [
         _plain(each)
         for word, each in values.items()
-        if each is not None
-        and _DISTORTION.match(plain_word(word))
-        and plain_word(word) not in _MODELS
+        if _DISTORTION.match(plain_word(word))
+        # Others describe a model.
+        and (isinstance(each, (list, dict)) or re.match(r"[\[(]?[-+.\d]", f"{each}"))
     ]
     names = [each for each in lenses if isinstance(each, list) and {*map(str, each)} <= _NAMED]
     lens = next((each for each in lenses if each not in names), None)
     if names and isinstance(lens, list) and len(names[0]) == len(lens):
-        lens = dict(zip(names[0], lens, strict=True))
-    if isinstance(lens, Mapping):
-        values, lens = {**values, **lens}, None
+        values, lens = {**values, **dict(zip(names[0], lens, strict=True))}, None
     if lens is not None:
         return lens
     if any(each in values for each in _COEFFICIENTS):
@@ -353,6 +357,8 @@ def _plain(value: Any) -> Any:
         data = value["data"]
         if isinstance(rows, int) and isinstance(columns, int) and rows * columns == len(data):
             return [data[i : i + columns] for i in range(0, len(data), columns)] if columns else []
+        if rows is None and columns is None:
+            return data
     return value
 
 
