@@ -1517,3 +1517,34 @@ def test_players_with_what_is_visible_beside(tmp_path: Path) -> None:
     check(found, names=LIMBS[:3])
     assert any("'upper' of the file" in line for line in found.report)
     assert found.confidence[0, found.names.index("r_ankle")] == 0
+
+
+def test_normalised_columns_beside_pixels(tmp_path: Path) -> None:
+    heading, *rows = headed({f"{t}": person(t) for t in T}).split("\n")
+    heading += "".join(f",{n}_norm_x,{n}_norm_y" for n in TFJS)
+    rows = [row + 17 * ",0.25,0.5" for row in rows]
+    found = read(write(tmp_path / "a.csv", "\n".join([heading, *rows])))
+    check(found)
+    assert found.names == COCO
+
+
+@pytest.mark.parametrize("word", ["landmarks", "detections", "poses", "kpts"])
+def test_frames_that_stand_where_people_do(tmp_path: Path, word: str) -> None:
+    """Some call the list of frames after what is in them."""
+    entries = [{"frame": t, "keypoints": (2 * person(t)[:, :2]).tolist()} for t in SEEN]
+    content = {"fps": 25, "width": 1280, "height": 960, word: entries}
+    check(read(write(tmp_path / "a.json", content)), (3,))
+
+
+@pytest.mark.parametrize("kind", ["size", "fractions", "MediaPipe's pixels"])
+def test_arrays_beside_the_size_of_the_video(tmp_path: Path, kind: str) -> None:
+    stack = np.stack([person(t) for t in T]) * (0.5, 0.5, 1)
+    if kind != "size":
+        stack = np.stack([person(t, ALIASES["MediaPipe-33"]) for t in T])
+        stack = np.insert(stack, 2, 0.1, axis=-1)
+    if kind == "fractions":
+        stack[..., :2] = (stack[..., :2] + 0.5) / SIZE
+    size = (320, 240) if kind == "size" else SIZE
+    np.savez(tmp_path / "a.npz", keypoints=stack, world=np.zeros_like(stack), fps=25.0,
+             width=size[0], height=size[1])  # fmt: skip
+    check(read(tmp_path / "a.npz"))

@@ -20,7 +20,7 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays, shortened, unexpected
 from torchcss.io.keypoints.frames import FRAMES_AT_MOST
-from torchcss.io.keypoints.mediapipe import LAYOUT, is_landmark_array, landmark_places
+from torchcss.io.keypoints.mediapipe import FOURS, LAYOUT, is_landmark_array, landmark_places
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
     Frames,
@@ -30,7 +30,7 @@ from torchcss.io.keypoints.people import (
     is_there,
     screened,
 )
-from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIZES, first_of
+from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIDES, SIZES, first_of
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
@@ -59,7 +59,9 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
             KeypointError, "", "the arrays keypoints, confidence and joint_names", list(arrays)
         )
     kind = path.suffix[1:].upper()
-    if landmarks := alone and is_landmark_array(array):
+    # Beside a size and the like only those are landmarks that have four numbers.
+    fours = not texts and first_of(arrays, SCORES) is None and array.shape[1:] in FOURS
+    if landmarks := (alone or fours) and is_landmark_array(array):
         values, kind = landmark_places(array)[:, None], f"MediaPipe landmarks, array {name}"
     else:
         values = _people(name, array)
@@ -82,7 +84,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         ]
         for frame in values
     ]
-    size = _positive("image size", first_of(numbers, SIZES), 2)
+    size = _positive("image size", _size(numbers), 2)
     noise = _positive("relative_noise", arrays.get("relative_noise"), 1)
     texts = {key: each for key, each in texts.items() if each.shape == values.shape[2:3]}
     return People(
@@ -94,6 +96,13 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         size_wh=None if size is None else (size[0], size[1]),
         relative_noise=noise[0] if noise else 1.0,
     )
+
+
+def _size(numbers: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """Width and height, as one array or as two."""
+    sides = ([first_of(numbers, (side,)) for side in pair] for pair in SIDES)
+    pairs = [np.array([w, h]) for w, h in sides if w is not None and h is not None]
+    return next(iter(pairs), None) if (size := first_of(numbers, SIZES)) is None else size
 
 
 def read_points(path: Path, keypoints: Keypoints) -> Keypoints:

@@ -240,6 +240,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
             return _frames(path, scored(inner, content), num_frames)
+        if isinstance(inner, list) and _key_of("", content) is None and _say_frames(inner):
+            return _frames(path, inner, num_frames)
         if inner is not None or "shapes" in content:
             return [people_of(str(path), content)]
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
@@ -315,6 +317,11 @@ def _key_of(where: str, entry: object) -> Key | None:
     codes = {k: code for k, text in texts.items() if (code := seconds_in(text)) is not None}
     time = first_of({**counts, **codes}, tuple(TIMES))
     return float(time) if time is not None else first_of(texts, PICTURES)
+
+
+def _say_frames(entries: Sequence[Any]) -> bool:
+    """Whether entries say of which frames they are."""
+    return bool(entries) and all(_key_of("", each) is not None for each in entries)
 
 
 def _frames_in(content: Mapping[str, Any]) -> list[Any] | dict[str, Any] | None:

@@ -43,7 +43,7 @@ PEOPLE = names_in(
 )
 JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
-    "pose kps keypointsxy keypoints2d joints2d"
+    "pose kps kpts keypointsxy keypoints2d joints2d"
 )
 _XY = {"x", "y"}
 _HEADS = names_in("meta_info metadata meta info header video video_info image")

@@ -24,6 +24,9 @@ from torchcss.joint_names import ALIASES, names_in
 
 LAYOUT = "MediaPipe-33"
 NUM_LANDMARKS = len(ALIASES[LAYOUT])
+FOURS = (NUM_LANDMARKS, 4), (4 * NUM_LANDMARKS,)
+"""Shapes of a frame's landmarks with z and visibility."""
+
 _FACE, _HAND = 468, 21
 _HOLISTIC = 4 * NUM_LANDMARKS + 3 * (_FACE + 2 * _HAND)
 """Numbers of the landmarks of body, face and hands in a row, the body's first."""

@@ -49,7 +49,11 @@ _PARTS = {
 }
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
-_UNITS = frozenset(names_in("px pixel pixels pos position coord loc img 2d"))
+_UNITS = frozenset(
+    names_in("px pixel pixels norm normalised normalized pos position coord loc img 2d")
+)
+_PIXELS = re.compile("(?i)(^|_)(px|pixels?)(_|$)")
+_FRACTIONS = re.compile("(?i)(^|_)norm(ali[sz]ed)?(_|$)")
 _IN_SPACE = frozenset(names_in("obj world 3d"))
 _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)(_|(?=[0-9])))+"
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
@@ -320,11 +324,11 @@ def _headed(heading: Sequence[str]) -> _Columns:
         split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
     columns: dict[tuple[str, str], dict[int, int]] = {}
     # Pixels before fractions, where a table has both.
-    in_pixels = [bool(re.search("(?i)(^|_)(px|pixels?)(_|$)", cell)) for cell in heading]
-    for index, each in sorted(enumerate(split), key=lambda each: not in_pixels[each[0]]):
+    ranks = [1 - bool(_PIXELS.search(cell)) + bool(_FRACTIONS.search(cell)) for cell in heading]
+    for index, each in sorted(enumerate(split), key=lambda each: ranks[each[0]]):
         if each is not None:
             own = columns.setdefault(("", each[0]), {})
-            twice = each[1] in own and in_pixels[index] == in_pixels[own[each[1]]]
+            twice = each[1] in own and ranks[index] == ranks[own[each[1]]]
             if twice and each[1] != 3 and each[0]:
                 raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
             own.setdefault(each[1], index)
