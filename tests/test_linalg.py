@@ -8,11 +8,6 @@ from torchcss import linalg
 BATCHES = [(), (5,), (2, 3)]
 
 
-def random_symmetric(*shape: int, generator: torch.Generator) -> torch.Tensor:
-    matrix = torch.randn(*shape, shape[-1], generator=generator, dtype=torch.float64)
-    return linalg.symmetric_part(matrix)
-
-
 def random_covariance(*shape: int, generator: torch.Generator) -> torch.Tensor:
     matrix = torch.randn(*shape, shape[-1], generator=generator, dtype=torch.float64)
     return matrix @ matrix.mT + 0.1 * torch.eye(shape[-1], dtype=torch.float64)

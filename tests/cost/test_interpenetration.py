@@ -25,7 +25,6 @@ from torchcss.types import Curvature, Keypoints, LocalModel
 from torchcss.vision.camera import Camera
 
 TERM = Interpenetration()
-ARM = ("r_shoulder_swing", "r_shoulder_raising", "r_shoulder_twist", "r_elbow_flexion")
 
 
 def moved(body: BodyModel) -> BodyModel:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
-
-Change = Callable[[np.ndarray], np.ndarray]
 
 
 def path_cost(

@@ -11,8 +11,6 @@ import pytest
 
 from torchcss.errors import ConfigurationError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "benchmark_batch.py"
-
 
 def test_both_ways_find_the_same(
     script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -14,8 +14,6 @@ from made_sequences import write_arm
 
 from torchcss.errors import ConfigurationError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "claims.py"
-
 
 def run_of(preset: str, seed: int, lost_s: float | None = None, **entries: Any) -> dict[str, Any]:
     times = [0.0, 1.0, 2.0]

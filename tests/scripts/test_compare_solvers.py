@@ -15,8 +15,6 @@ import torch
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.robust import Lorentzian, Quadratic
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
 
 def small(script: ModuleType, **options):
     return script.Config(starts=20, subset=3, repeats=1, cores=1, **options)

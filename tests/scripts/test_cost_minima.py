@@ -10,8 +10,6 @@ import pytest
 
 from torchcss.cost.contour import ContourTerm
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "cost_minima.py"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script.main(script.Config(small=True, out=tmp_path))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -12,8 +10,6 @@ import pytest
 from made_sequences import write_arm
 
 from torchcss.studies.sequences import read_sequence
-
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "cost_slices.py"
 
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,11 +60,3 @@ def test_frames_are_those_at_the_papers_times(
     config = script.Config(sequence=tmp_path, times=(1 / rate, 3 / rate))
     names = [scene.name for scene in script.scenes(config)]
     assert names == [f"{tmp_path.name}, frame {frame}" for frame in (1, 3)]
-
-
-def test_bad_frame_is_one_line() -> None:
-    run = subprocess.run(
-        [sys.executable, str(SCRIPT), "--frame", "0"], capture_output=True, text=True
-    )
-    assert run.returncode == 2
-    assert run.stderr.startswith("error: frames [0]")

@@ -13,8 +13,6 @@ from made_flows import write_flow
 
 from torchcss.errors import FlowFileError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_flow.py"
-
 
 def test_made_up_pair(
     script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -16,8 +16,6 @@ from torchcss.studies.render.sequences import shot
 from torchcss.studies.sequence_writer import write_sequence
 from torchcss.studies.sequences import read_reference
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_peers.py"
-
 
 def test_landmarks_are_turned_into_the_world(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -15,8 +15,6 @@ from torchcss.errors import ConfigurationError
 from torchcss.studies.render.sequences import shot
 from torchcss.studies.sequence_writer import write_sequence
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_posterior.py"
-
 
 def test_a_clip_is_tracked_and_measured(script: ModuleType, tmp_path: Path) -> None:
     write_sequence(tmp_path / "clips" / "one", shot("body-clutter", num_frames=3, small=True))

@@ -11,8 +11,6 @@ from made_sequences import write_arm
 
 from torchcss.errors import ConfigurationError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_shape.py"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     arm, out = tmp_path / "arm", tmp_path / "tables" / "shape.json"

@@ -9,8 +9,6 @@ import pytest
 
 from torchcss.errors import ConfigurationError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "evaluate_sides.py"
-
 
 def test_motions_are_filmed_and_mended(script: ModuleType, shared_data: Path) -> None:
     report = script.main(script.Config(motions=shared_data / "mocap_cmu", rates=(30.0, 5.0)))

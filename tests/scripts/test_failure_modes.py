@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -19,8 +17,6 @@ from torchcss.studies.plots import ErrorCurves, error_curves, failure_figure
 from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.settings import TERMS, Settings
-
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "failure_modes.py"
 
 
 @pytest.fixture(scope="module")
@@ -188,14 +184,6 @@ def test_bad_options(
 ) -> None:
     with pytest.raises(ConfigurationError, match=message):
         script.main(script.Config(sequence=arm, **change))
-
-
-def test_command_line(tmp_path: Path) -> None:
-    command = [sys.executable, str(SCRIPT), "--sequence", str(tmp_path / "absent")]
-    run = subprocess.run(command, capture_output=True, text=True)
-    assert run.returncode == 2
-    assert run.stderr.startswith("error: ")
-    assert "is no folder" in run.stderr
 
 
 def test_published_figures_are_of_our_trackers() -> None:

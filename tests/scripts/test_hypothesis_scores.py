@@ -14,8 +14,6 @@ from made_sequences import write_arm
 
 from torchcss.errors import ConfigurationError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "hypothesis_scores.py"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
     folder, out = tmp_path / "arm", tmp_path / "scores.json"

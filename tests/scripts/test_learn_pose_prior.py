@@ -12,8 +12,6 @@ import pytest
 from torchcss.cost.pose_prior import FILE
 from torchcss.errors import ConfigurationError
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "learn_pose_prior.py"
-
 
 def test_it_learns_and_judges(script: ModuleType, shared_data: Path, tmp_path: Path) -> None:
     motions = shared_data / "mocap_cmu_large"

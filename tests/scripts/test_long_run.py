@@ -10,8 +10,6 @@ from types import ModuleType
 
 import numpy as np
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "long_run.py"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
     out = tmp_path / "long.json"

@@ -13,8 +13,6 @@ import torch
 from torchcss.errors import ConfigurationError
 from torchcss.studies.sequences import read_sequence
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "make_clips.py"
-
 
 def test_clips_are_the_same_however_many_are_made(
     script: ModuleType, shared_data: Path, tmp_path: Path

@@ -15,8 +15,6 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.video import VideoReader
 from torchcss.studies.sequences import read_sequence
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "make_sequence.py"
-
 
 def test_a_folder_holds_what_was_rendered(script: ModuleType, tmp_path: Path) -> None:
     config = script.Config(sequence="body-dark", out=tmp_path / "dark", frames=3, small=True)

@@ -13,8 +13,6 @@ from made_sequences import write_arm
 from torchcss.body.load import load_body
 from torchcss.studies.sequences import read_sequence
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "model_variations.py"
-
 
 def small(script: ModuleType, folder: Path, **changes: object):
     write_arm(folder, 3)

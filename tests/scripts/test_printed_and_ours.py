@@ -11,8 +11,6 @@ from made_sequences import write_arm
 
 from torchcss.studies.sequences import read_sequence
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "printed_and_ours.py"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
     folder, out = tmp_path / "arm", tmp_path / "exchange.json"

@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
-
-def test_stages_within_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    spec = importlib.util.spec_from_file_location("profile_frame", SCRIPTS / "profile_frame.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "profile_frame", module)
-    spec.loader.exec_module(module)
+def test_stages_within_stages(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
-    monkeypatch.setattr(module.time, "process_time", lambda: now[0])
+    monkeypatch.setattr(script.time, "process_time", lambda: now[0])
 
     def spend(seconds: float) -> None:
         now[0] += seconds
 
-    clock, (inner, *_, outer) = module.Clock(), module.STAGES
+    clock, (inner, *_, outer) = script.Clock(), script.STAGES
     kernel, inside = clock.kernel(spend), clock.stage(inner, lambda: kernel(2.0))
 
     def frame() -> None:

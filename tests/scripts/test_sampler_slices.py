@@ -8,8 +8,6 @@ from types import ModuleType
 
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "sampler_slices.py"
-
 
 def test_scaled_covariances_place_samples_at_low_cost(
     script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -74,6 +74,8 @@ def test_a_report_says_how_it_was_made(
         ("inverse_kinematics", {"cases": ("foo",)}, r"no cases \['foo'\]; there are ur5"),
         ("table1", {"body": "foo"}, "no body 'foo'; expected one of"),
         ("table1", {"pose": NOWHERE / "pose.json"}, "pose.json: there is no such file"),
+        ("failure_modes", {"sequence": NOWHERE}, "is no folder"),
+        ("cost_slices", {"frame": 0}, r"^frames \[0\]"),
         ("sampler_slices", {"body": "foo"}, "no body 'foo'; expected one of"),
         ("compare_solvers", {"solvers": ("foo",)}, r"no solvers \['foo'\]; there are torchcss"),
         ("compare_solvers", {"solvers": ("scipy trf",)}, "all are compared with torchcss"),

@@ -14,8 +14,6 @@ from made_sequences import write_arm
 
 from torchcss.body.load import load_body
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "spectra.py"
-
 
 def test_two_frames(script: ModuleType, tmp_path: Path) -> None:
     write_arm(tmp_path / "arm", 2)

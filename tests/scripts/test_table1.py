@@ -13,8 +13,6 @@ import torch
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.sampling_study import StudyChoice, run_sampler, spectrum, study_problem
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "table1.py"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, figures = tmp_path / "tables" / "table1.json", tmp_path / "figures"

@@ -13,8 +13,6 @@ from made_robots import write_quadruped
 
 from torchcss.studies.render.robots import trot
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
 
 @pytest.fixture(params=["made here", "ANYmal"])
 def urdf(request: pytest.FixtureRequest, tmp_path: Path) -> Path:

@@ -13,8 +13,6 @@ from made_robots import write_arm
 
 from torchcss.errors import ConfigurationError
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = script.main(
