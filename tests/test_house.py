@@ -27,9 +27,9 @@ def nodes(path: Path) -> Iterator[ast.AST]:
     return ast.walk(ast.parse(path.read_text(encoding="utf-8")))
 
 
-def of_package(paths: list[Path], *, ids: bool = True) -> pytest.MarkDecorator:
+def of_package(paths: list[Path]) -> pytest.MarkDecorator:
     names = [str(path.relative_to(REPOSITORY)) for path in paths]
-    return pytest.mark.parametrize("path", paths, ids=names if ids else None)
+    return pytest.mark.parametrize("path", paths, ids=names)
 
 
 @of_package(MODULES)

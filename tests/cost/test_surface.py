@@ -30,19 +30,19 @@ def a_field(generator: torch.Generator) -> SplineField:
     return spline_field(torch.randn(1, HEIGHT, WIDTH, generator=generator, dtype=torch.float64))
 
 
-def some_nodes(generator: torch.Generator, *, count: int = 40) -> tuple[Tensor, Tensor]:
+def some_nodes(generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Nodes in the image, beside it, and behind the camera; some of them turned away."""
-    points = torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    points = torch.randn(2, 40, 3, generator=generator, dtype=torch.float64)
     points[..., 2] = points[..., 2].abs() + 1.5
     points[:, 0, :2] = 4.0
     points[:, 1, 2] = -1.0
-    normals = torch.randn(2, count, 3, generator=generator, dtype=torch.float64)
+    normals = torch.randn(2, 40, 3, generator=generator, dtype=torch.float64)
     return points, torch.nn.functional.normalize(normals, dim=-1)
 
 
-def some_targets(generator: torch.Generator, *, count: int = 40) -> SurfaceTargets:
-    level = torch.randn(2, count, generator=generator, dtype=torch.float64)
-    weight = torch.rand(2, count, generator=generator, dtype=torch.float64)
+def some_targets(generator: torch.Generator) -> SurfaceTargets:
+    level = torch.randn(2, 40, generator=generator, dtype=torch.float64)
+    weight = torch.rand(2, 40, generator=generator, dtype=torch.float64)
     weight[:, 5] = 0
     return SurfaceTargets(level, weight)
 

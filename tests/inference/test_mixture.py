@@ -102,11 +102,11 @@ def test_stratified_components_get_their_share(generator):
     assert draw_components(weight, 0, generator=generator).shape == (0,)
 
 
-def planted(generator: torch.Generator, copies: int = 40):
+def planted(generator: torch.Generator):
     """Known modes, each found many times with a small error, in random order."""
     truth = random_mixture(5, 4, generator=generator)
     truth = truth._replace(mean=50 * truth.mean)
-    which = torch.arange(5).repeat(copies)[torch.randperm(5 * copies, generator=generator)]
+    which = torch.arange(5).repeat(40)[torch.randperm(5 * 40, generator=generator)]
     error = 0.01 * torch.randn(len(which), 4, generator=generator, dtype=torch.float64)
     cost = which + 1e-4 * torch.rand(len(which), generator=generator, dtype=torch.float64)
     return truth, truth.mean[which] + error, truth.covariance[which], cost, which

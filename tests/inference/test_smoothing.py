@@ -222,8 +222,8 @@ def test_bad_paths_are_refused():
 # --- refinement ----------------------------------------------------------------------------------
 
 
-def gaussian(t: int, n: int, seed: int = 0) -> GaussianEvidence:
-    evidence = GaussianEvidence.of_modes(draw(t, n, seed=seed), covariances(t, n=n, seed=seed + 1))
+def gaussian(t: int, n: int) -> GaussianEvidence:
+    evidence = GaussianEvidence.of_modes(draw(t, n, seed=0), covariances(t, n=n, seed=1))
     if t > 4:
         evidence.precision[2] = 0.0  # a frame that says nothing
     return evidence

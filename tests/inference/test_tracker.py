@@ -413,7 +413,7 @@ def test_separation_keeps_modes_whose_landmarks_differ(generator):
     assert found(SearchProblem(Comb()), 2.8, 3) == [0, 1, -1]
 
 
-def step_of_rivals(generator, *, soft_matching: bool, likelihood_power: float = 1.0):
+def step_of_rivals(generator, *, soft_matching: bool):
     """Of two modes the first has all the weight, and meets a rival that is cheaper, and alike."""
     tracker = replace(
         CSS,
@@ -421,7 +421,6 @@ def step_of_rivals(generator, *, soft_matching: bool, likelihood_power: float = 
         num_modes=2,
         separation=1.6,
         soft_matching=soft_matching,
-        likelihood_power=likelihood_power,
     )
     past = GaussianMixture(
         torch.tensor([[1.4, 0.0], [0.0, 0.0]]).double(),

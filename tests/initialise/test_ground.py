@@ -33,12 +33,12 @@ def camera(*, placed: bool = True) -> Camera:
     return Camera(seen.K, (1280, 960), R_camera_world=LEVEL, t_camera_world=-LEVEL @ place)
 
 
-def standing(scale: float, floor: float = 0.0) -> Initialisation:
+def standing(scale: float) -> Initialisation:
     """Somebody who stands before the camera, larger or smaller than is usual."""
     body = load_body("body34", scale=scale)
     x = body.rest
     lowest = body.surface(body.pose(x)).points[..., 1].min()
-    place = torch.tensor([0.0, floor - float(lowest), -AWAY], dtype=torch.float64)
+    place = torch.tensor([0.0, -float(lowest), -AWAY], dtype=torch.float64)
     body = body.with_base(torch.eye(3, dtype=torch.float64), place)
     n = len(x)
     mixture = GaussianMixture(x[None], torch.eye(n).to(x)[None], x.new_zeros(1))

@@ -26,9 +26,9 @@ from torchcss.studies.random_person import RandomPerson, random_person
 from torchcss.types import Keypoints
 
 
-def person_and_cost(seed: int = 0, **options) -> tuple[RandomPerson, TrackingCost]:
+def person_and_cost(**options) -> tuple[RandomPerson, TrackingCost]:
     """A person and the cost of the marks, lengths known."""
-    someone = random_person(generator=torch.Generator().manual_seed(seed), **options)
+    someone = random_person(generator=torch.Generator().manual_seed(0), **options)
     keypoints = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
     choice = CostChoice(terms=(JointTerm(sigma=2.0), Stabiliser(), Anthropometric()))
     view = FrameContext(body=someone.body, camera=someone.camera, keypoints=keypoints)

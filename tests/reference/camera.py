@@ -24,7 +24,6 @@ def skew_camera(
     *,
     away: float = 3.0,
     distortion: list[float] | None = None,
-    name: str = "test",
 ) -> Camera:
     """A camera that stands askew, the world's origin some metres before it."""
     return Camera(
@@ -33,5 +32,5 @@ def skew_camera(
         distortion=distortion,
         R_camera_world=rotation(0.8, 0.3, 0.4),
         t_camera_world=[0.1, -0.2, away],
-        name=name,
+        name="test",
     )

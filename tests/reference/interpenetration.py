@@ -26,8 +26,9 @@ def part_frames(body: BodyModel, x: Tensor) -> list[tuple[Tensor, Tensor]]:
     return frames
 
 
-def nodes_of(body: BodyModel, part: int, rings: int = 4, meridians: int = 6) -> Tensor:
+def nodes_of(body: BodyModel, part: int) -> Tensor:
     """Rings of nodes and the poles, in the part's frame."""
+    rings, meridians = 4, 6
     shape = body.part_shape[part]
     nodes = []
     for ring in range(rings):

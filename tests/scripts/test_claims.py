@@ -27,8 +27,8 @@ def run_of(preset: str, seed: int, lost_s: float | None = None, **entries: Any) 
     }  # fmt: skip
 
 
-def report_of(sequence: str, runs: list[dict[str, Any]], path: Path, body: str = "arm8") -> Path:
-    path.write_text(json.dumps({"study": {"sequence": sequence, "body": body}, "runs": runs}))
+def report_of(runs: list[dict[str, Any]], path: Path, body: str = "arm8") -> Path:
+    path.write_text(json.dumps({"study": {"sequence": "arm", "body": body}, "runs": runs}))
     return path
 
 
@@ -61,8 +61,8 @@ def test_claims_are_judged(script: ModuleType, tmp_path: Path) -> None:
     out = tmp_path / "claims.json"
     config = script.Config(
         failures=(
-            report_of("arm", runs, tmp_path / "arm.json"),
-            report_of("arm", seven, tmp_path / "arm7.json", "arm7"),
+            report_of(runs, tmp_path / "arm.json"),
+            report_of(seven, tmp_path / "arm7.json", "arm7"),
         ),
         table1=table1_of(tmp_path / "table1.json"),
         spectra=tmp_path / "spectra.json",
@@ -114,7 +114,7 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
     weight = [0.0, *np.where(depth[:2] > np.median(depth[:2]), 0.9, 0.1).tolist()]
     run = run_of("ijrr_css", 0)
     run["per_frame"]["apart_weight"] = weight
-    path = report_of("arm", [run], tmp_path / "arm.json")
+    path = report_of([run], tmp_path / "arm.json")
     claim = "several modes appear mainly while the arm moves in depth"
     assert verdicts(script.main(script.Config(failures=(path,))))[claim] == (
         "because the sequence is not given", "not tested",
@@ -133,7 +133,7 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
 def test_weights_help_where_the_error_is_less(script: ModuleType, tmp_path: Path) -> None:
     claim = "weighing contours by foreground and motion boundaries improves much"
     few, many = (
-        report_of("arm", [run_of("ijrr_css", 0, root_aligned_mm=mm)], tmp_path / f"{mm}.json")
+        report_of([run_of("ijrr_css", 0, root_aligned_mm=mm)], tmp_path / f"{mm}.json")
         for mm in (40.0, 60.0)
     )
     seen = verdicts(script.main(script.Config(failures=(few,), unweighted=(many,))))[claim]

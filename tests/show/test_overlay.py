@@ -39,8 +39,8 @@ def changed(image, drawn):
     return (image != drawn).any(-1)
 
 
-def rings(height, width, u, v):
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+def rings(u, v):
+    y, x = torch.meshgrid(torch.arange(120), torch.arange(160), indexing="ij")
     return ((x - u) ** 2 + (y - v) ** 2).sqrt()
 
 
@@ -49,7 +49,7 @@ def test_only_the_body_and_its_outline_change(dtype):
     image = grey()
     drawn = draw_overlay(image, [disc(70, 60, 30, dtype=dtype)])
     assert (image == 90).all()  # the input is not touched
-    touched, distance = changed(image, drawn), rings(120, 160, 70, 60)
+    touched, distance = changed(image, drawn), rings(70, 60)
     assert touched[distance < 29].all()
     assert not touched[distance > 34].any()
     # Inside translucent and bluish, the outline bright.
@@ -81,7 +81,7 @@ def test_other_modes_are_outlines_and_their_weight_shows():
     def ink(share):
         other = disc(70, 60, 30)
         drawn = draw_overlay(image, [best, other], weights=[1.0, share])
-        distance = rings(120, 160, 70, 60)
+        distance = rings(70, 60)
         assert not changed(image, drawn)[(distance - 30).abs() > 4].any()
         line = drawn[(distance - 30).abs() < 0.5].float().mean(0)
         return line - 90
@@ -97,7 +97,7 @@ def test_hidden_parts_are_dashed(monkeypatch):
     front, back = disc(70, 60, 40, depth=1.0, part=0), disc(70, 60, 20, depth=2.0, part=1)
     with_back = draw_overlay(image, [together(front, back)])
     alone = draw_overlay(image, [front])
-    ring = (rings(120, 160, 70, 60) - 20).abs() < 0.6
+    ring = (rings(70, 60) - 20).abs() < 0.6
     lit = (with_back.float() - alone.float()).mean(-1)[ring] > 10
     assert 0.15 < lit.float().mean() < 0.85
     # The same with the parts' depths exchanged is a solid line.
@@ -112,10 +112,10 @@ def test_meshes_of_one_part_share_an_outline(monkeypatch):
     monkeypatch.setattr(overlay, "_FILL", 0.0)
     one = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20))])
     two = draw_overlay(image, [together(disc(60, 60, 20), disc(80, 60, 20, part=1))])
-    lens = rings(120, 160, 60, 60).maximum(rings(120, 160, 80, 60)) < 15
+    lens = rings(60, 60).maximum(rings(80, 60)) < 15
     assert not changed(image, one)[lens].any()
     assert changed(image, one).any()
-    border = ((rings(120, 160, 80, 60) - 20).abs() < 1) & (rings(120, 160, 60, 60) < 15)
+    border = ((rings(80, 60) - 20).abs() < 1) & (rings(60, 60) < 15)
     assert changed(image, two)[border].any()
 
 
@@ -176,7 +176,7 @@ def test_keypoints_are_rings_and_missing_ones_are_skipped():
     points = torch.tensor([[40.0, 30], [torch.nan, 5], [-300, 50], [torch.inf, 1], [159.4, 119.2]])
     drawn = draw_overlay(image, [], keypoints=points)
     touched = changed(image, drawn)
-    near = (rings(120, 160, 40, 30) < 8) | (rings(120, 160, 159.4, 119.2) < 8)
+    near = (rings(40, 30) < 8) | (rings(159.4, 119.2) < 8)
     assert touched[near].any()
     assert not touched[~near].any()
     assert drawn[100:, 150:].float().max() > 200

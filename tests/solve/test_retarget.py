@@ -48,7 +48,7 @@ PARENTS = {
 
 
 def capture_of(
-    body: BodyModel, states: torch.Tensor, rate: float = 25.0, leave_out: tuple[str, ...] = ()
+    body: BodyModel, states: torch.Tensor, leave_out: tuple[str, ...] = ()
 ) -> MotionCapture:
     """A motion of a body as motion capture would have it, zero pose and all."""
     names = [name for name in PARENTS if name not in leave_out]
@@ -61,17 +61,17 @@ def capture_of(
         tuple(-1 if parent is None else names.index(parent) for parent in above),
         (rest - rest[0]).numpy(),
         body.pose(states).joints[:, index].numpy(),
-        rate,
+        25.0,
         (),
     )
 
 
-def moving(body: BodyModel, count: int = 40, turns: float = 0.0, seed: int = 0) -> torch.Tensor:
+def moving(body: BodyModel, count: int = 40, turns: float = 0.0) -> torch.Tensor:
     """Smooth states about the stabilisers' rest, well within the limits, turning on the spot.
 
     At the rate of `capture_of` every angle swings once in 1.6 seconds.
     """
-    source = torch.Generator().manual_seed(seed)
+    source = torch.Generator().manual_seed(0)
     t = torch.arange(count, dtype=torch.float64)[:, None] / 40
     phase = 2 * math.pi * torch.rand(body.num_parameters, generator=source, dtype=torch.float64)
     spread = torch.where(body.sticky_deviation.isfinite(), body.sticky_deviation, 0.1)

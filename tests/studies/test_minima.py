@@ -19,12 +19,12 @@ FREE = problems.unbounded(2)
 BOX = problems.box(2, -3, 3)
 
 
-def banana(ripple: float, wavelength: float = 0.4) -> problems.AutogradCost:
+def banana(ripple: float) -> problems.AutogradCost:
     """A steep valley along a parabola, with ripples of a given height on its floor."""
 
     def function(x):
         u, v = x.unbind(-1)
-        wave = 0.5 * ripple * (1 - torch.cos(2 * torch.pi * u / wavelength))
+        wave = 0.5 * ripple * (1 - torch.cos(5 * torch.pi * u))
         return 500 * (v - u**2) ** 2 + wave + 0.01 * u**2
 
     return problems.AutogradCost(function)

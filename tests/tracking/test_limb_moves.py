@@ -76,8 +76,8 @@ def proposed(
     return None if jumps is None else jumps.mixture
 
 
-def arm(body: BodyModel, name: str = "r_arm") -> Limb:
-    return next(limb for limb in Segments(body).limbs if limb.name == name)
+def arm(body: BodyModel) -> Limb:
+    return next(limb for limb in Segments(body).limbs if limb.name == "r_arm")
 
 
 def names(limbs: list[Limb]) -> list[str]:

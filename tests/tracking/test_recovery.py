@@ -36,12 +36,12 @@ RECOVERY = Recovery(monitor=LossMonitor(burn_in=3, slack=2.5, threshold=4.0), sa
 
 
 def track(
-    sequence: SyntheticSequence, num_frames: int, recovery: Recovery | None, seed: int = 0
+    sequence: SyntheticSequence, num_frames: int, recovery: Recovery | None
 ) -> list[Posterior]:
     """Track from the true first pose; some frames show a wall."""
     wall = np.random.default_rng(0).integers(88, 93, (480, 640, 3), np.uint8)
     images = (wall if index in ELSEWHERE else image for index, image in enumerate(sequence.frames))
-    settings = replace(SETTINGS, seed=seed, recovery=recovery is not None)
+    settings = replace(SETTINGS, recovery=recovery is not None)
     session = session_at(settings, sequence.body, sequence.states[0], seen_by(sequence.camera))
     session.plan = session.plan._replace(recovery=recovery)
     session.state = session.state._replace(

@@ -53,9 +53,9 @@ def the_camera() -> Camera:
     return Camera(K, (WIDTH, HEIGHT), R_camera_world=np.diag([1.0, -1.0, -1.0]))
 
 
-def poses(count: int = 1, seed: int = 0) -> Tensor:
+def poses(count: int = 1) -> Tensor:
     body = the_body()
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     x = body.rest + 0.05 * torch.randn(count, len(body.rest), generator=generator).double()
     return body.bounds.project(x)
 

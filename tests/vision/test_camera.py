@@ -20,9 +20,9 @@ WILD = [-0.014, 1.419, -0.0035, -0.0036, -6.394]
 """A real calibration whose sixth-order term folds the image at a normalised radius of 0.6."""
 
 
-def make_camera(distortion: list[float] | None = None, name: str = "test") -> Camera:
+def make_camera(distortion: list[float] | None = None) -> Camera:
     focal, centre, size = (900.0, 880.0), (317.0, 243.0), (640, 480)
-    return skew_camera(focal, centre, size, distortion=distortion, name=name)
+    return skew_camera(focal, centre, size, distortion=distortion)
 
 
 def hessian_of(camera: Camera, model: ProjectionModel) -> Tensor:

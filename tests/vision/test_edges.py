@@ -11,9 +11,9 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
 
 
-def step_image(height: int = 60, width: int = 80, low: float = 0.3, high: float = 0.7) -> Tensor:
+def step_image(low: float = 0.3, high: float = 0.7) -> Tensor:
     """A vertical step between columns 39 and 40."""
-    image = torch.full((height, width), low, dtype=torch.float64)
+    image = torch.full((60, 80), low, dtype=torch.float64)
     image[:, 40:] = high
     return image
 

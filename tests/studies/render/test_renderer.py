@@ -56,8 +56,9 @@ def camera(height, width, focal):
     return look_at(EYE.tolist(), (0, 0, 0), focal_px=focal, image_size_wh=(width, height))
 
 
-def soup(generator, count=60, size=40.0, dtype=torch.float32):
+def soup(generator, size=40.0, dtype=torch.float32):
     """Random triangles, many of them partly or wholly out of the image."""
+    count = 60
     centre = torch.rand(count, 1, 2, generator=generator) * 80 - 20
     uv = centre + size * (torch.rand(count, 3, 2, generator=generator) - 0.5)
     depth = 1 + 3 * torch.rand(count, 3, generator=generator)

@@ -31,8 +31,9 @@ WIDE, HIGH = 80, 60
 SHIFT = torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64)
 
 
-def sphere(middle: Tensor, radius: float, rings: int = 24, meridians: int = 36) -> Tensor:
-    """Corners that go with `grid_faces(rings, meridians)`."""
+def sphere(middle: Tensor, radius: float) -> Tensor:
+    """Corners that go with `grid_faces(24, 36)`."""
+    rings, meridians = 24, 36
     eta = (torch.arange(rings).double() + 0.5) / rings * math.pi - math.pi / 2
     omega = torch.arange(meridians).double() * (2 * math.pi / meridians)
     eta, omega = torch.meshgrid(eta, omega, indexing="ij")
