@@ -1466,6 +1466,7 @@ def test_joints_in_capitals(tmp_path: Path) -> None:
     entries = [{"Frame": t, "Joints": [{"Name": n, "X": x, "Y": y, "Confidence": c}
                 for n, (x, y, c) in zip(TFJS, person(t), strict=True)]} for t in T]  # fmt: skip
     check(read(write(tmp_path / "a.json", entries)))
+    check(read(write(tmp_path / "a.json", {"Version": 2, "Frames": entries})))
 
 
 @pytest.mark.parametrize("around", ["results", "pictures"])

@@ -87,7 +87,7 @@ _OTHERS = {
 _HUGE = 1e19
 """No number of a frame is so large, nor a time, were it in nanoseconds since 1970."""
 
-_FRAMES = ("frames", "instance_info", "results", "data")
+_FRAMES = ("frames", "instanceinfo", "results", "data")
 
 
 def read_json(path: Path, image_size_wh: Size, num_frames: int | None) -> People:
@@ -326,7 +326,7 @@ def _say_frames(entries: Sequence[Any]) -> bool:
 
 def _frames_in(content: Mapping[str, Any]) -> list[Any] | dict[str, Any] | None:
     """What a file has under a word for frames; None: it has no such word."""
-    return next((content[k] for k in _FRAMES if isinstance(content.get(k), (list, dict))), None)
+    return first_of({k: v for k, v in content.items() if isinstance(v, (list, dict))}, _FRAMES)
 
 
 def _size(content: Any) -> tuple[float, float] | None:

@@ -45,7 +45,7 @@ TRACKS = names_in(
 """That by which a person is known again in another frame."""
 
 VIDEOS = names_in(
-    "video videoname videoid videopath videofile clip clipname sequence camera cameraid cameraname "
+    "video videoname videoid videopath videofile clip clipname camera cameraid cameraname "
     "cam camid view port"
 )
 """Which of several videos an entry belongs to."""
