@@ -1479,6 +1479,9 @@ def test_the_size_that_a_frame_says(tmp_path: Path, around: str) -> None:
     found = read(write(tmp_path / "a.json", content))
     check(found)
     assert any("scaled from images of 320 x 240" in line for line in found.report)
+    box = {"bbox": {"left": 1, "top": 2, "width": 64, "height": 48}, "keypoints": flat(0)}
+    found = read(write(tmp_path / "a.json", box), num_frames=1)
+    assert not any("scaled" in line for line in found.report)
 
 
 def test_entries_of_several_videos_are_no_people(tmp_path: Path) -> None:

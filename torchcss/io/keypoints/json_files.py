@@ -332,7 +332,8 @@ def _frames_in(content: Mapping[str, Any]) -> list[Any] | dict[str, Any] | None:
 def _size(content: Any) -> tuple[float, float] | None:
     """The size of the images that the file or its first frame names."""
     inner = _frames_in(content) if isinstance(content, dict) else None
-    inner = content if inner is None else inner
+    if inner is None and isinstance(content, dict) and key_of(content, (*PEOPLE, *JOINTS)) is None:
+        inner = content  # by picture
     frames = [*inner.values()] if isinstance(inner, dict) else inner
     return said_size(content) or said_size(frames)
 
