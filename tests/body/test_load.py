@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import sys
 from pathlib import Path
 
@@ -571,6 +570,18 @@ def test_bad_requests(tmp_path: Path) -> None:
     assert load_body(path).num_parameters == 11  # XML says its encoding itself
 
 
+def arm_with(path: Path, **content: str) -> Path:
+    """A planar arm some of whose links have content."""
+    text = planar_arm(path, 0.5, 0.4).read_text()
+    for link, inside in content.items():
+        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{inside}</link>')
+    return write(path, text)
+
+
+def visual(mesh: str) -> str:
+    return f'<visual><geometry><mesh filename="{mesh}"/></geometry></visual>'
+
+
 @pytest.mark.parametrize("end", [None, b"", b"\n", b"obj"])
 def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, end: bytes | None) -> None:
     name = "a.obj" if end == b"obj" else "a.stl"
@@ -586,15 +597,12 @@ def test_a_link_is_as_large_as_the_box_around_its_mesh(tmp_path: Path, end: byte
         content = f"solid a\nfacet normal 0 0 1\nouter loop\n{rows}endloop\nendfacet\n".encode()
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / name).write_bytes(content)
-    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
     mesh = (
         '<visual><origin xyz="0.2 0 0" rpy="0 1.5707963267948966 0"/><geometry>'
         f'<mesh filename="package://arm/meshes/{name}" scale="0.001 0.001 0.001"/>'
         "</geometry></visual>"
     )
-    text = path.read_text().replace('<link name="link2"/>', f'<link name="link2">{mesh}</link>')
-    path.write_text(text)
-    body = load_body(path)
+    body = load_body(arm_with(tmp_path / "arm.urdf", link2=mesh))
     assert "arm.urdf: as large as the boxes around their meshes: 'link2'" in body.notes
     part = body.part_names.index("link2")
     np.testing.assert_allclose(body.part_shape[part, :3], [0.03, 0.05, 0.2], atol=1e-12)
@@ -613,17 +621,9 @@ COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" versi
 <instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes></COLLADA>"""
 
 
-def with_a_mesh(path: Path, name: str, content: str) -> Path:
-    planar_arm(path, 0.5, 0.4)
-    (path.parent / name).write_text(content)
-    mesh = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
-    text = path.read_text().replace('<link name="link2"/>', f'<link name="link2">{mesh}</link>')
-    path.write_text(text)
-    return path
-
-
 def test_collada_says_its_unit_and_where_a_mesh_stands(tmp_path: Path) -> None:
-    body = load_body(with_a_mesh(tmp_path / "arm.urdf", "a.dae", COLLADA))
+    write(tmp_path / "a.dae", COLLADA)
+    body = load_body(arm_with(tmp_path / "arm.urdf", link2=visual("a.dae")))
     part = body.part_names.index("link2")
     np.testing.assert_allclose(body.part_shape[part, :3], [0.03, 0.05, 0.2], atol=1e-12)
     np.testing.assert_allclose(body.part_translation[part], [0.4, 0, 0], atol=1e-12)
@@ -636,19 +636,16 @@ def test_collada_says_its_unit_and_where_a_mesh_stands(tmp_path: Path) -> None:
 
 
 def test_a_link_of_many_metres_is_told(tmp_path: Path) -> None:
-    path = with_a_mesh(tmp_path / "arm.urdf", "a.obj", "v 0 0 0\nv 50 90 400\n")
+    write(tmp_path / "a.obj", "v 0 0 0\nv 50 90 400\n")
+    path = arm_with(tmp_path / "arm.urdf", link2=visual("a.obj"))
     note = "link 'link2' is 400 m large by its mesh, more than links are: if that is in millimetres"
     assert any(note in each for each in load_body(path).notes)
 
 
 def test_meshes_that_stand_for_a_link_are_told(tmp_path: Path) -> None:
-    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
-    mesh = '<visual><geometry><mesh filename="package://arm/meshes/a.dae"/></geometry></visual>'
+    mesh = visual("package://arm/meshes/a.dae")
     ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
-    text = path.read_text()
-    for link, inside in (("link1", mesh + ball), ("link2", mesh), ("tip", "")):
-        text = text.replace(f'<link name="{link}"/>', f'<link name="{link}">{inside}</link>')
-    path.write_text(text)
+    path = arm_with(tmp_path / "arm.urdf", link1=mesh + ball, link2=mesh, tip="")
     notes = load_body(path).notes
     assert notes[0] == "arm.urdf: limits, axes and solids: as the URDF says"
     assert len(notes) == 2
@@ -663,10 +660,8 @@ def test_a_mesh_of_many_links_is_read_once(tmp_path: Path, monkeypatch: pytest.M
         return mesh_points(path)
 
     monkeypatch.setattr("torchcss.body.files.urdf.mesh_points", points)
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 2 3\n")
-    path = planar_arm(tmp_path / "arm.urdf", 0.5, 0.4)
-    mesh = '<visual><geometry><mesh filename="a.obj"/></geometry></visual>'
-    path.write_text(re.sub(r'(<link name="link[12]")/>', rf"\1>{mesh}</link>", path.read_text()))
+    write(tmp_path / "a.obj", "v 0 0 0\nv 1 2 3\n")
+    path = arm_with(tmp_path / "arm.urdf", link1=visual("a.obj"), link2=visual("a.obj"))
     assert {"link1", "link2"} <= {*load_body(path).part_names}
     assert len(read) == 1
 
