@@ -67,19 +67,22 @@ def marks(someone: RandomPerson) -> dict[str, tuple[float, ...]]:
     }
 
 
-def find(someone: RandomPerson, search: Search = SMALL, **options) -> Initialisation:
+def seen(someone: RandomPerson) -> Keypoints:
+    return Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
+
+
+def fit(given: Keypoints | dict, camera: Camera, body: Any = "body34", **options) -> Initialisation:
+    """Initialise without a picture."""
     return initialise(
-        None,
-        Keypoints(someone.keypoints, someone.confidence, someone.joint_names),
-        someone.camera,
-        generator=torch.Generator().manual_seed(0),
-        # Random persons are in poses that nobody takes.
-        options=InitialiseOptions(
-            sigma=2.0,
-            search=search,
-            **{"least_joints": LEAST_JOINTS, "pose_prior": False, **options},
-        ),
-    )
+        None, given, camera, body, generator=torch.Generator().manual_seed(0),
+        options=InitialiseOptions(**{"search": SMALL, **options}),
+    )  # fmt: skip
+
+
+def find(someone: RandomPerson, search: StartSearch = SMALL, **options) -> Initialisation:
+    # Random persons are in poses that nobody takes.
+    options = {"least_joints": LEAST_JOINTS, "pose_prior": False, **options}
+    return fit(seen(someone), someone.camera, sigma=2.0, search=search, **options)
 
 
 def error_mm(found: Initialisation, someone: RandomPerson) -> np.ndarray:
@@ -218,7 +221,7 @@ def test_colours_tell_the_outline_of_a_chequered_shirt():
     room = clutter_background(height, width, generator=torch.Generator().manual_seed(1))
     picture = render_meshes(_in_squares(someone), camera, background=room)
     truth = part_map(someone.body, someone.state, camera) >= 0
-    keypoints = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
+    keypoints = seen(someone)
     overlap, girth = [], []
     for colours in (False, True):
         found = initialise(
@@ -288,9 +291,7 @@ def test_few_joints_leave_the_prior_and_say_so():
     someone = person()
     one = marks(someone)
     two = {name: one[name] for name in ("l_shoulder", "l_elbow")}
-    generator = torch.Generator().manual_seed(0)
-    options = InitialiseOptions(search=SMALL, num_modes=2, pose_prior=False)
-    found = initialise(None, two, someone.camera, generator=generator, options=options)
+    found = fit(two, someone.camera, num_modes=2, pose_prior=False)
     line = next(line for line in found.report if line.startswith("not determined"))
     for name in ("r_knee_flexion", "l_hip_twist", "neck_twist"):
         assert name in line
@@ -307,10 +308,8 @@ def test_unseen_legs_stand_as_people_do():
     someone = person()
     above = {name: place for name, place in marks(someone).items()
              if not name.endswith(("knee", "ankle"))}  # fmt: skip
-    generator, knees = torch.Generator().manual_seed(0), ["l_knee_flexion", "r_knee_flexion"]
-    options = InitialiseOptions(search=SMALL, num_modes=2)
-    found = initialise(None, above, someone.camera, generator=generator, options=options)
-    column = found.body.state_columns(knees)
+    found = fit(above, someone.camera, num_modes=2)
+    column = found.body.state_columns(["l_knee_flexion", "r_knee_flexion"])
     spread = found.mixture.covariance[0].diagonal().sqrt()[column]
     assert bool((spread < 0.8 * found.body.sticky_deviation[column]).all())
 
@@ -319,10 +318,8 @@ def test_swapped_sides_are_reported_and_left_as_they_are():
     someone = person(3, joint_names=(*person().joint_names, "nose", "l_toe", "r_toe"))
     legs = {"hip", "knee", "ankle", "toe"}
     swapped = tuple(_swap(name, legs) for name in someone.joint_names)
-    generator = torch.Generator().manual_seed(0)
     given = dict(zip(swapped, someone.keypoints.tolist(), strict=True))
-    options = InitialiseOptions(search=SMALL, num_modes=1)
-    found = initialise(None, given, someone.camera, generator=generator, options=options)
+    found = fit(given, someone.camera, num_modes=1)
     assert any("left and right look swapped in the legs" in line for line in found.report)
 
 
@@ -336,9 +333,7 @@ def test_odd_marks_are_named_and_gross_ones_move_little():
     spoilt = marks(someone)
     spoilt["l_wrist"] = spoilt["l_elbow"]
     spoilt["r_ankle"] = (30.0, 1200.0)
-    generator = torch.Generator().manual_seed(0)
-    options = InitialiseOptions(search=SMALL, sigma=2.0, num_modes=1)
-    found = initialise(None, spoilt, someone.camera, generator=generator, options=options)
+    found = fit(spoilt, someone.camera, sigma=2.0, num_modes=1)
     report = "\n".join(found.report)
     assert "at the same place: l_elbow and l_wrist" in report
     assert "outside the image: r_ankle" in report
@@ -435,19 +430,10 @@ def test_arms_and_single_precision():
     camera = person().camera
     uv = camera.project(body.pose(x).joints).uv
     keypoints = Keypoints(uv, torch.ones(4), body.joint_names)
-    found = initialise(
-        None, keypoints, camera, "arm7", generator=torch.Generator().manual_seed(0),
-        options=InitialiseOptions(search=SMALL, dtype=torch.float32),
-    )  # fmt: skip
+    found = fit(keypoints, camera, "arm7", dtype=torch.float32)
     assert found.body.dtype == found.mixture.mean.dtype == torch.float32
     assert float(found.cost[0]) < 8
-    placed, again = (
-        initialise(
-            None, keypoints, camera, body, generator=torch.Generator().manual_seed(0),
-            options=InitialiseOptions(search=SMALL, sigma=2.0),
-        )
-        for _ in range(2)
-    )  # fmt: skip
+    placed, again = (fit(keypoints, camera, body, sigma=2.0) for _ in range(2))
     assert torch.equal(placed.mixture.mean, again.mixture.mean)
     assert torch.equal(placed.mixture.covariance, again.mixture.covariance)
     # An elbow that bends the other way, or not: some hypothesis is the truth.
@@ -538,9 +524,8 @@ def test_a_coarse_pose_leads_a_single_start_to_the_fit(found: Initialisation):
 @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, math.pi])
 def test_a_start_is_turned_as_the_joints_say(yaw: float, generator: torch.Generator):
     someone = person()
-    seen = Keypoints(someone.keypoints, someone.confidence, someone.joint_names)
     body = load_body("body34", free_proportions=True)
-    body = hang_before_camera(body, someone.camera, match_joints(seen, body.joint_names))
+    body = hang_before_camera(body, someone.camera, match_joints(seen(someone), body.joint_names))
     x = body.rest[None].clone()
     x[:, body.state_index("root_yaw")] = yaw
     marked = body.pose(x).joints[0]
@@ -582,20 +567,14 @@ def test_a_detectors_points_are_a_start() -> None:
     someone = person(4, noise_px=0.0)
     names = tuple(n for n in someone.joint_names if n in someone.body.joint_names)
     away = someone.camera.R_camera_world.to(torch.float64) @ someone.joints_world(names).T
-    known = Keypoints(someone.keypoints, someone.confidence, someone.joint_names).only(names)
+    known = seen(someone).only(names)
     told = known._replace(points=1.3 * (away.T - away.T.mean(0)))  # of a larger person
     alone = StartSearch(num_starts=1, num_flips=0, num_samples=0, leave_out=False)
-    options = InitialiseOptions(sigma=1.0, search=alone, least_joints=LEAST_JOINTS)
+    options = {"sigma": 1.0, "search": alone, "least_joints": LEAST_JOINTS}
 
     def error(keypoints: Keypoints) -> tuple[float, float]:
-        found = initialise(
-            None, keypoints, someone.camera, generator=torch.Generator().manual_seed(0),
-            options=options,
-        )  # fmt: skip
-        index = found.body.joint_columns(LIMB_JOINTS)
-        joints = found.body.pose(found.mixture.mean[:1]).joints[:, index].numpy()
-        truth = someone.joints_world(LIMB_JOINTS).numpy()
-        return float(found.cost[0]), float(pa_mpjpe_mm(joints, truth)[0])
+        found = fit(keypoints, someone.camera, **options)
+        return float(found.cost[0]), float(error_mm(found, someone)[0])
 
     (cost, near), (cost_alone, far) = error(told), error(known)
     assert near < 0.6 * far
