@@ -24,6 +24,25 @@ BEAM_UP = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 """Turns Y up into Z up: world (x, y, z) = body (z, x, y)."""
 
 
+def writer_of(body: BodyModel, path: Path | str = "unused") -> TrackWriter:
+    return TrackWriter(path, Track.empty(body.state_names, body.joint_names, body=body))
+
+
+def modes_at(
+    body: BodyModel, frame: int, state: torch.Tensor, covariance: torch.Tensor,
+    *, rate: float = 25.0, **changes: Any,
+) -> FrameModes:  # fmt: skip
+    """Modes of a frame at states `[k n]` of a body on its base; alike unless changed."""
+    k, n = state.shape
+    base = np.eye(4)
+    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
+    alike = {"log_weight": torch.zeros(k), "cost": torch.zeros(k), "parent": torch.full((k,), -1)}
+    return FrameModes(
+        frame=frame, time_s=frame / rate, state=state, covariance=covariance.expand(k, n, n),
+        joints_world=body.pose(state).joints, base_transform=base, **{**alike, **changes},
+    )  # fmt: skip
+
+
 def make_track(
     body: BodyModel,
     counts: Sequence[int] = (2, 3, 2),
@@ -36,8 +55,7 @@ def make_track(
     """Random poses within the joint limits, standing about upright; the base moves in frame 2."""
     source = torch.Generator().manual_seed(0)
     up = torch.eye(3, dtype=torch.float64) if up is None else up
-    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
-    n = body.num_parameters
+    writer, n = writer_of(body), body.num_parameters
     lower = body.lower.clamp(min=-spread)
     upper = body.upper.clamp(max=spread)
     for index, k in enumerate(counts):
@@ -49,23 +67,14 @@ def make_track(
         share = torch.rand(k, n, generator=source, dtype=torch.float64)
         state = lower + share * (upper - lower)
         factor = 0.02 * torch.randn(k, n, n, generator=source, dtype=torch.float64) / math.sqrt(n)
-        base = np.eye(4)
-        base[:3, :3], base[:3, 3] = turn, shift
+        above = torch.arange(k).flip(0) % counts[index - 1] if index else torch.full((k,), -1)
         writer.append(
-            FrameModes(
-                frame=first_frame + index,
-                time_s=(first_frame + index) / rate,
-                state=state,
-                covariance=factor @ factor.mT,
+            modes_at(
+                placed, first_frame + index, state, factor @ factor.mT, rate=rate, parent=above,
                 log_weight=torch.linspace(1.0, 0.5, k).softmax(0).log(),
                 cost=torch.linspace(1.0, 2.0, k),
-                parent=torch.full((k,), -1)
-                if not index
-                else torch.arange(k).flip(0) % counts[index - 1],
-                joints_world=placed.pose(state).joints,
-                base_transform=base,
             )
-        )
+        )  # fmt: skip
     return writer.track()
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from made_clip import track
-from made_tracks import make_track
+from made_tracks import make_track, modes_at, writer_of
 from reference.kinematics import rotation
 
 from torchcss import load_body, load_track
@@ -24,7 +24,6 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.tracks import (
-    FrameModes,
     Track,
     TrackWriter,
     read_summary,
@@ -62,7 +61,7 @@ def noisy_track(
     source = torch.Generator().manual_seed(0)
     n, frames = body.num_parameters, frames or list(range(t))
     truth = true_motion(body, t)
-    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
+    writer = writer_of(body)
     for index in frames:
         noise = DEVIATION * torch.randn(1 + others, n, generator=source, dtype=torch.float64)
         state = truth[index] + noise
@@ -80,21 +79,9 @@ def noisy_track(
         state = placed.bounds.project(state)
         cost = torch.zeros(1 + others).double()
         cost[0] = 0.5 if index % 5 == 2 else -0.5
-        base = np.eye(4)
-        base[:3, :3], base[:3, 3] = placed.base_rotation, placed.base_translation
-        writer.append(
-            FrameModes(
-                frame=index,
-                time_s=index / RATE,
-                state=state,
-                covariance=(DEVIATION**2 * torch.eye(n)).repeat(1 + others, 1, 1),
-                log_weight=(-cost).log_softmax(0),
-                cost=cost,
-                parent=torch.full((1 + others,), -1),
-                joints_world=placed.pose(state).joints,
-                base_transform=base,
-            )
-        )
+        told = {"log_weight": (-cost).log_softmax(0), "cost": cost}
+        spread = DEVIATION**2 * torch.eye(n)
+        writer.append(modes_at(placed, index, state, spread, rate=RATE, **told))
     return writer.track(), truth[frames]
 
 

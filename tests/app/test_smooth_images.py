@@ -12,6 +12,7 @@ import pytest
 import torch
 from made_clip import track
 from made_sequences import rendered_arm
+from made_tracks import modes_at, writer_of
 
 from torchcss import load_track
 from torchcss.app.smooth import run_settings, smooth_frames, smooth_track
@@ -19,7 +20,7 @@ from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.initialise.view import CameraView
 from torchcss.io.run import Run
-from torchcss.io.tracks import FrameModes, Track, TrackWriter, read_summary
+from torchcss.io.tracks import Track, read_summary
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.settings import Settings
 from torchcss.tracking.smooth import Smoothing
@@ -48,26 +49,12 @@ class Setup(NamedTuple):
 @pytest.fixture
 def setup(sequence: SyntheticSequence) -> Setup:
     body, camera, source = sequence.body, sequence.camera, torch.Generator().manual_seed(1)
-    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
-    n = body.num_parameters
+    writer, n = writer_of(body), body.num_parameters
     for index, state in enumerate(sequence.states):
         noisy = state + 0.08 * torch.randn(1, n, generator=source, dtype=torch.float64)
         noisy = body.bounds.project(noisy)
-        writer.append(
-            FrameModes(
-                frame=index,
-                time_s=index / sequence.frame_rate,
-                state=noisy,
-                covariance=0.08**2 * torch.eye(n)[None],
-                log_weight=torch.zeros(1),
-                cost=torch.zeros(1),
-                parent=torch.zeros(1) - 1,
-                joints_world=body.pose(noisy).joints,
-                base_transform=base,
-            )
-        )
+        spread = 0.08**2 * torch.eye(n)
+        writer.append(modes_at(body, index, noisy, spread, rate=sequence.frame_rate))
     exact = camera.project(sequence.joints_world).uv
     seen = exact + NOISE_PX * torch.randn(exact.shape, generator=source, dtype=torch.float64)
     keypoints = Keypoints(seen, torch.ones_like(seen[..., 0]), body.joint_names)

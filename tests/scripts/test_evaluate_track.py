@@ -11,6 +11,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from made_tracks import modes_at, writer_of
 
 import torchcss
 from torchcss.body.load import load_body
@@ -174,24 +175,9 @@ def test_calibration_is_told_of_a_run_that_knows_its_body(
     # Where the whole body is, in depth above all, is not what errors from the hips are of.
     root = torch.tensor([0.04, 0.04, 0.09, 1e-8, 1e-8, 1e-8])
     spread = torch.diag(torch.cat([root, torch.full((n - 6,), 4e-4)]).double())
-    writer = TrackWriter(
-        tmp_path / "track.npz", Track.empty(body.state_names, body.joint_names, body=body)
-    )
-    tracked = body.pose(body.rest).joints
+    writer = writer_of(body, tmp_path / "track.npz")
     for row in range(count):
-        writer.append(
-            FrameModes(
-                frame=row,
-                time_s=row / 25,
-                state=body.rest[None].numpy(),
-                covariance=spread[None].numpy(),
-                log_weight=np.zeros(1),
-                cost=np.zeros(1),
-                parent=np.full(1, -1),
-                base_transform=np.eye(4),
-                joints_world=tracked[None].numpy(),
-            )
-        )
+        writer.append(modes_at(body, row, body.rest[None], spread))
     writer.save()
     noise = torch.randn(count, n, generator=generator, dtype=torch.float64) @ spread.sqrt()
     joints = body.pose(body.rest + noise).joints.numpy()
@@ -230,21 +216,13 @@ def test_a_run_in_other_axes_is_turned_as_a_whole(
 def test_stated_regions_turn_with_the_run(tmp_path: Path) -> None:
     """Thin regions along one axis of the camera hold errors along that axis of the world."""
     body = load_body("body34", dtype=torch.float64)
-    n = body.num_parameters
-    spread = 1e-8 * np.eye(n)
+    spread = 1e-8 * torch.eye(body.num_parameters, dtype=torch.float64)
     spread[body.state_index("root_yaw")] *= 1e5
-    modes = FrameModes(
-        frame=0, time_s=0.0, state=body.rest[None].numpy(), covariance=spread[None],
-        log_weight=np.zeros(1), cost=np.zeros(1), parent=np.full(1, -1), base_transform=np.eye(4),
-        joints_world=body.pose(body.rest).joints[None].numpy(),
-    )  # fmt: skip
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    writer = TrackWriter(
-        tmp_path / "track.npz", Track.empty(body.state_names, body.joint_names, body=body)
-    )
-    writer.append(modes)
+    writer = writer_of(body, tmp_path / "track.npz")
+    writer.append(modes_at(body, 0, body.rest[None], spread))
     writer.save()
-    places = modes.joints_world @ turn.T
+    places = body.pose(body.rest[None]).joints.numpy() @ turn.T
     reference = write_reference(tmp_path / "r.npz", places, list(body.joint_names))
     straight, turned = (torchcss.evaluate(tmp_path, reference, turned=t) for t in (False, True))
     assert straight.covariance is not None

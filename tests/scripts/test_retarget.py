@@ -12,12 +12,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from made_tracks import export_as
+from made_tracks import export_as, modes_at, writer_of
 
 from torchcss import load_body
 from torchcss.errors import ConfigurationError, MotionCaptureError, OutputError
 from torchcss.io.motion.positions import LIMB_JOINTS
-from torchcss.io.tracks import FrameModes, Track, TrackWriter
 from torchcss.studies.sequences import read_reference
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
@@ -27,7 +26,7 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A BVH of our own: ten frames at 20 Hz of a body that turns and bends its arms."""
     body = load_body("body34", lengths={"thigh": 0.41})
-    writer = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
+    writer = writer_of(body)
     for index in range(10):
         state = body.bounds.project(body.sticky_mean.clone())
         state[body.state_index("root_yaw")] = 0.2 * index
@@ -35,18 +34,7 @@ def motion(tmp_path_factory: pytest.TempPathFactory) -> Path:
         state[body.state_index("l_elbow_flexion")] = 0.5 + 0.1 * math.sin(0.5 * index)
         for side in "lr":
             state[body.state_index(f"{side}_shoulder_raising")] = 0.6
-        writer.append(
-            FrameModes(
-                frame=index,
-                time_s=index / 20,
-                state=state[None],
-                covariance=torch.eye(len(state), dtype=state.dtype)[None],
-                log_weight=torch.zeros(1),
-                cost=torch.zeros(1),
-                parent=torch.full((1,), -1),
-                joints_world=body.pose(state).joints[None],
-            )
-        )
+        writer.append(modes_at(body, index, state[None], torch.eye(len(state)), rate=20.0))
     folder = tmp_path_factory.mktemp("motion")
     done = export_as(writer.track(), to="bvh", out=folder, frame="world")
     return done.paths[0]
