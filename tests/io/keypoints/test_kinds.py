@@ -1479,6 +1479,8 @@ def test_the_size_that_a_frame_says(tmp_path: Path, around: str) -> None:
     found = read(write(tmp_path / "a.json", content))
     check(found)
     assert any("scaled from images of 320 x 240" in line for line in found.report)
+    boxes = [{"left": 9, "top": 8, "width": 64, "height": 48, "joints": flat(t)} for t in T]
+    check(read(write(tmp_path / "a.json", boxes)))
     box = {"bbox": {"left": 1, "top": 2, "width": 64, "height": 48}, "keypoints": flat(0)}
     found = read(write(tmp_path / "a.json", box), num_frames=1)
     assert not any("scaled" in line for line in found.report)

@@ -46,6 +46,9 @@ JOINTS = names_in(
     "pose kps kpts keypointsxy keypoints2d joints2d"
 )
 _XY = {"x", "y"}
+_BOX = frozenset(names_in("x left x1 xmin"))
+"""What has a word of these has the size of a box."""
+
 _HEADS = names_in("meta_info metadata meta info header video video_info image")
 
 
@@ -247,7 +250,7 @@ def _row(where: str, row: Any) -> list[float]:
 
 def heads(content: object) -> list[dict[str, Any]]:
     """What a file says of itself: in its outermost object, and in one that is called so."""
-    if not isinstance(content, dict) or "x" in content:  # a box
+    if not isinstance(content, dict) or not _BOX.isdisjoint(content):
         return []
     inner = (each for key, each in content.items() if key in _HEADS)
     return [content, *(each for each in inner if isinstance(each, dict))]
