@@ -1534,7 +1534,17 @@ def test_normalised_columns_beside_pixels(tmp_path: Path) -> None:
     assert found.names == COCO
 
 
-@pytest.mark.parametrize("word", ["landmarks", "detections", "poses", "kpts"])
+def test_a_box_beside_named_joints(tmp_path: Path) -> None:
+    heading, *rows = headed({f"{t},1,2,300,400": person(t) for t in T}, "frame,x1,y1,x2,y2").split(
+        "\n"
+    )
+    found = read(write(tmp_path / "a.csv", "\n".join([heading, *rows])))
+    check(found)
+    assert found.names == COCO
+    assert any("columns left out: 'x1, y1, x2, y2'" in line for line in found.report)
+
+
+@pytest.mark.parametrize("word", ["landmarks", "detections", "poses", "kpts", "pose_timeline"])
 def test_frames_that_stand_where_people_do(tmp_path: Path, word: str) -> None:
     """Some call the list of frames after what is in them."""
     entries = [{"frame": t, "keypoints": (2 * person(t)[:, :2]).tolist()} for t in SEEN]

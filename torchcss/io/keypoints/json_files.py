@@ -240,8 +240,9 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
             return _frames(path, scored(inner, content), num_frames)
-        if isinstance(inner, list) and _key_of("", content) is None and _say_frames(inner):
-            return _frames(path, inner, num_frames)
+        told = [each for each in content.values() if isinstance(each, list) and _say_frames(each)]
+        if len(told) == 1 and _key_of("", content) is None:
+            return _frames(path, told[0], num_frames)
         if inner is not None or "shapes" in content:
             return [people_of(str(path), content)]
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
@@ -320,8 +321,13 @@ def _key_of(where: str, entry: object) -> Key | None:
 
 
 def _say_frames(entries: Sequence[Any]) -> bool:
-    """Whether entries say of which frames they are."""
-    return bool(entries) and all(_key_of("", each) is not None for each in entries)
+    """Whether entries hold people, and say of which frames they are."""
+    return bool(entries) and all(
+        isinstance(each, dict)
+        and key_of(each, (*PEOPLE, *JOINTS)) is not None
+        and _key_of("", each) is not None
+        for each in entries
+    )
 
 
 def _frames_in(content: Mapping[str, Any]) -> list[Any] | dict[str, Any] | None:

@@ -336,6 +336,8 @@ def _headed(heading: Sequence[str]) -> _Columns:
     if numbers := [joint for joint in half if joint.isdecimal()]:
         raise KeypointError(f"row 1: joint {numbers[0]} has x or y, not both")
     columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
+    if any(joint.strip("0123456789") for _, joint in columns):  # numbers beside names are a box's
+        columns = {joint: parts for joint, parts in columns.items() if not joint[1].isdecimal()}
     if joint is not None and set(columns) == {("", "")}:
         track = None if track == joint else track
         return _Columns({("", ""): columns["", ""]}, len(heading), frame, joint, track, time)

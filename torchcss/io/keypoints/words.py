@@ -40,7 +40,7 @@ PICTURES = names_in(
 TRACKS = names_in(
     "trackid track trackname tracking trackingid idx personid person personidx personname "
     "individual individuals instanceid instance objectid subjectid subject playerid player person "
-    "identity pid tid id"
+    "identity bodyid pid tid id"
 )
 """That by which a person is known again in another frame."""
 
