@@ -109,7 +109,7 @@ def test_solver_reaches_the_dense_solution(generator: torch.Generator) -> None:
     gradient = torch.autograd.functional.jacobian(energy, zero)
     hessian = torch.autograd.functional.hessian(energy, zero)
     expected = -torch.linalg.solve(hessian, gradient)
-    found = module._solve(start, module._Quadratic.of(constancy, weight, right, down), 80)
+    found = module._solve(start, module._Quadratic.of(constancy, weight, right, down), 300)
     torch.testing.assert_close(found.flatten(), expected, rtol=1e-8, atol=1e-9)
 
 

@@ -1,36 +1,15 @@
 """The inner loops of the optical flow, compiled; their twins in torch stand in the modules.
 
-A conjugate-gradient step in torch is a dozen passes over the image, each of which fetches it from
-memory anew. Here a step is three passes, each row at a time. Where numba cannot be imported the
+A step of the flow's solver is a dozen passes over the image in torch, each of which fetches it from
+memory anew. Here all steps of a solve are one pass. Where numba cannot be imported the
 flow takes torch's way, as it does on a GPU and in double precision.
 """
 
 from __future__ import annotations
 
-from collections import namedtuple
-
 import numpy as np
 
-from torchcss.kernels.compiler import entry, floor, inlined, kernel, sqrt
-
-FlowMemory = namedtuple("FlowMemory", "degree inverse x image residual conditioned")
-"""Memory for `solve_flow`.
-
-Attributes:
-    degree: Sum of each pixel's links, `[h w]`.
-    inverse: Inverse of each pixel's block, `[3 h w]`.
-    x: A direction inside a border of zeros, `[2 h+2 w+2]`.
-    image: The matrix times it, `[2 h w]`.
-    residual: What is left.
-    conditioned: The same, preconditioned.
-"""
-
-
-def make_flow_memory(height: int, width: int) -> FlowMemory:
-    """Memory for images of a size."""
-    inside = [np.empty((channels, height, width), np.float32) for channels in (3, 2, 2, 2)]
-    border = np.zeros((2, height + 2, width + 2), np.float32)
-    return FlowMemory(np.empty((height, width), np.float32), inside[0], border, *inside[1:])
+from torchcss.kernels.compiler import entry, floor, inlined, sqrt
 
 
 @inlined
@@ -141,106 +120,74 @@ def _weigh_links(u, v, other_u, other_v, potential, weight):  # type: ignore[no-
         weight[c] = _weight(d_u * d_u + d_v * d_v, potential)
 
 
-@kernel
-def _apply(x, q, degree, right, down, product):  # type: ignore[no-untyped-def]
-    """Matrix times vector, inside a border of zeros; returns their inner product."""
-    height, width = degree.shape
-    total = np.float64(0.0)  # over all rows
-    for row in range(height):
-        along = 0.0
-        for c in range(width):
-            u, v = x[0, row + 1, c + 1], x[1, row + 1, c + 1]
-            common = q[0, row, c] * u + q[1, row, c] * v
-            before, after = right[row, c], right[row, c + 1]
-            above, below = down[row, c], down[row + 1, c]
-            to_u = degree[row, c] * u + q[0, row, c] * common
-            to_v = degree[row, c] * v + q[1, row, c] * common
-            to_u -= before * x[0, row + 1, c] + after * x[0, row + 1, c + 2]
-            to_v -= before * x[1, row + 1, c] + after * x[1, row + 1, c + 2]
-            to_u -= above * x[0, row, c + 1] + below * x[0, row + 2, c + 1]
-            to_v -= above * x[1, row, c + 1] + below * x[1, row + 2, c + 1]
-            product[0, row, c] = to_u
-            product[1, row, c] = to_v
-            along += u * to_u + v * to_v
-        total += along
-    return total
-
-
-@kernel
-def _descend(length, x, image, inverse, flow, residual, conditioned):  # type: ignore[no-untyped-def]
-    """Go along a direction; the new residual, preconditioned, and their inner product."""
-    height, width = flow.shape[1:]
-    total = np.float64(0.0)  # over all rows
-    for row in range(height):
-        along = 0.0
-        for c in range(width):
-            flow[0, row, c] += length * x[0, row + 1, c + 1]
-            flow[1, row, c] += length * x[1, row + 1, c + 1]
-            r_u = residual[0, row, c] - length * image[0, row, c]
-            r_v = residual[1, row, c] - length * image[1, row, c]
-            residual[0, row, c], residual[1, row, c] = r_u, r_v
-            z_u = inverse[0, row, c] * r_u + inverse[2, row, c] * r_v
-            z_v = inverse[1, row, c] * r_v + inverse[2, row, c] * r_u
-            conditioned[0, row, c], conditioned[1, row, c] = z_u, z_v
-            along += r_u * z_u + r_v * z_v
-        total += along
-    return total
-
-
-@kernel
-def _turn(share, conditioned, x):  # type: ignore[no-untyped-def]
-    """The next direction."""
-    height, width = conditioned.shape[1:]
-    for row in range(height):
-        for c in range(width):
-            x[0, row + 1, c + 1] = conditioned[0, row, c] + share * x[0, row + 1, c + 1]
-            x[1, row + 1, c + 1] = conditioned[1, row, c] + share * x[1, row + 1, c + 1]
-
-
 @entry
-def solve_flow(flow, q, target, right, down, num_iterations, memory):  # type: ignore[no-untyped-def]
-    """Improve a flow, in place, by conjugate gradients on `(q q^T + L) f = target`.
+def inverse_blocks(flow, energy, inverse, target):  # type: ignore[no-untyped-def]
+    """Inverse of each pixel's block (uu, vv, uv) and the target beside it, as `_inverse_blocks`.
 
     Args:
         flow: `[2 h w]`, single precision.
-        q: Gradient of the brightness times the root of its weight, `[2 h w]`.
-        target: Right-hand side, `[2 h w]`.
-        right: Weights of the links between columns, `[h w+1]`, zero at both ends.
-        down: The same between rows, `[h+1 w]`.
-        num_iterations: Steps.
-        memory: Memory for what is found on the way; the border of `x` is zero.
+        energy: The gradient of brightness times the root of its weight, the target, and the weights
+            of links, as `weigh` has found them.
+        inverse: `[3 h w]`.
+        target: `[2 h w]`.
     """
+    q, wanted, right, down = energy
     height, width = flow.shape[1:]
-    degree, inverse, x, image, residual, conditioned = memory
     for row in range(height):
         for c in range(width):
             links = right[row, c] + right[row, c + 1] + down[row, c] + down[row + 1, c]
-            q_u, q_v = q[0, row, c], q[1, row, c]
-            determinant = links * (links + q_u * q_u + q_v * q_v)
-            share = 1.0 / determinant if determinant > 0.0 else 0.0
-            degree[row, c] = links
-            inverse[0, row, c] = (links + q_v * q_v) * share
-            inverse[1, row, c] = (links + q_u * q_u) * share
-            inverse[2, row, c] = -q_u * q_v * share
-            x[0, row + 1, c + 1], x[1, row + 1, c + 1] = flow[0, row, c], flow[1, row, c]
-    _apply(x, q, degree, right, down, image)
-    for row in range(height):
-        for c in range(width):
-            x[0, row + 1, c + 1] = x[1, row + 1, c + 1] = 0.0
-            residual[0, row, c] = target[0, row, c] - image[0, row, c]
-            residual[1, row, c] = target[1, row, c] - image[1, row, c]
-    reduction = _descend(0.0, x, image, inverse, flow, residual, conditioned)
-    _turn(0.0, conditioned, x)
-    for _ in range(num_iterations):
-        bend = _apply(x, q, degree, right, down, image)
-        if not bend > 0.0:
-            break
-        length = np.float32(reduction / bend)
-        before = reduction
-        reduction = _descend(length, x, image, inverse, flow, residual, conditioned)
-        if not before > 0.0:
-            break
-        _turn(np.float32(reduction / before), conditioned, x)
+            u, v = q[0, row, c], q[1, row, c]
+            linked = links > 0.0
+            share = 1.0 / (links * (links + u * u + v * v)) if linked else np.float32(1)
+            inverse[0, row, c] = (links + v * v) * share if linked else np.float32(1)
+            inverse[1, row, c] = (links + u * u) * share if linked else np.float32(1)
+            inverse[2, row, c] = -u * v * share if linked else np.float32(0)
+            target[0, row, c] = wanted[0, row, c] if linked else flow[0, row, c]
+            target[1, row, c] = wanted[1, row, c] if linked else flow[1, row, c]
+
+
+@inlined
+def _relax(x, before, system, shares, step, row):  # type: ignore[no-untyped-def]
+    """A step of one row, in place of what was there before the last one."""
+    target, inverse, right, down = system
+    length, keep = shares[step, 0], shares[step, 1]
+    for c in range(target.shape[2]):
+        k = c + 1
+        left, along, up, under = right[row, c], right[row, k], down[row, c], down[row + 1, c]
+        u = target[0, row, c] + left * x[0, row + 1, c] + along * x[0, row + 1, c + 2]
+        v = target[1, row, c] + left * x[1, row + 1, c] + along * x[1, row + 1, c + 2]
+        u += up * x[0, row, k] + under * x[0, row + 2, k]
+        v += up * x[1, row, k] + under * x[1, row + 2, k]
+        to_u = inverse[0, row, c] * u + inverse[2, row, c] * v
+        to_v = inverse[1, row, c] * v + inverse[2, row, c] * u
+        u, v = x[0, row + 1, k], x[1, row + 1, k]
+        before[0, row + 1, k] = u + length * (to_u - u) + keep * (u - before[0, row + 1, k])
+        before[1, row + 1, k] = v + length * (to_v - v) + keep * (v - before[1, row + 1, k])
+
+
+@entry
+def solve_flow(one, other, system, shares):  # type: ignore[no-untyped-def]
+    """Improve a flow, in place, by Chebyshev's semi-iteration; see `torchcss.vision.flow`.
+
+    Every step follows the one before at a distance of one row: what they share stays in the cache.
+
+    Args:
+        one: The flow inside a border of zeros, `[2 h+2 w+2]`, single precision; after an even
+            number of steps the result.
+        other: A copy; after an odd number of steps the result.
+        system: Right-hand side, `[2 h w]`; inverse of each pixel's block (uu, vv, uv), `[3 h w]`;
+            weights of the links between columns, `[h w+1]`, and between rows, `[h+1 w]`, zero at
+            the ends.
+        shares: Of Jacobi's step and of the change before, for each step, `[n 2]`.
+    """
+    height, num = system[0].shape[1], len(shares)
+    for front in range(height + num - 1):
+        for step in range(max(0, front - height + 1), min(front + 1, num)):
+            # Each array keeps its place in a call: only so is it seen that they differ.
+            if step % 2 == 0:
+                _relax(one, other, system, shares, step, front - step)
+            else:
+                _relax(other, one, system, shares, step, front - step)
 
 
 @inlined
