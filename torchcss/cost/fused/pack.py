@@ -432,7 +432,7 @@ def make_limb_scratch(tree: Tree, limbs: Limbs, num_parameters: int) -> LimbScra
 def make_prior_scratch(mixture: Mixture) -> PriorScratch:
     """Memory for the priors on the state."""
     modes, size = mixture.mean.shape
-    return PriorScratch(np.zeros(size), np.zeros(modes), np.zeros((modes, size)))
+    return PriorScratch(np.zeros(size), np.zeros(modes), np.zeros((modes, size)), np.zeros(size))
 
 
 def pack_priors(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from torchcss.cost.fused.records import Array, Gaussian, LongTails, Mixture, PriorScratch, Result
-from torchcss.kernels.compiler import entry, kernel
+from torchcss.kernels.compiler import entry, inlined, kernel
 
 _FAR = 1e150
 """Deviations whose square does not overflow."""
@@ -40,7 +40,7 @@ def add_priors(
         result.value[b] += _long_tails(x[b], mode[b], tails, gradient, hessian)
         result.value[b] += _gaussian(x[b], gaussian, scratch.pull, gradient, hessian)
         if mixture.weight > 0.0:
-            value = _mixture(x[b], mixture, scratch.share, scratch.pulls)
+            value = _mixture(x[b], mixture, scratch)
             result.value[b] += mixture.weight * value
             if len(gradient):
                 _mixture_slopes(mixture, scratch, gradient, hessian)
@@ -86,26 +86,26 @@ def _gaussian(x: Array, gaussian: Gaussian, pull: Array, gradient: Array, hessia
 
 
 @kernel
-def _mixture(x: Array, mixture: Mixture, share: Array, pulls: Array) -> float:
+def _mixture(x: Array, mixture: Mixture, scratch: PriorScratch) -> float:
     """Cost about the mixture before; its modes' shares, and their pulls."""
-    most = -mixture.nu
-    for k in range(len(mixture.height)):
-        exponent = mixture.height[k]
+    share, offset, most = scratch.share, scratch.pull, -mixture.nu
+    for k in range(len(share)):
+        exponent, mean, pull = mixture.height[k], mixture.mean[k], scratch.pulls[k]
         for i in range(len(x)):
-            pull = 0.0
-            for j in range(len(x)):
-                offset = min(max(x[j] - mixture.mean[k, j], -mixture.far), mixture.far)
-                pull += mixture.precision[k, i, j] * offset
-            offset = min(max(x[i] - mixture.mean[k, i], -mixture.far), mixture.far)
-            pulls[k, i] = pull
-            exponent -= 0.5 * offset * pull
+            offset[i] = min(max(x[i] - mean[i], -mixture.far), mixture.far)
+            pull[i] = 0.0
+        for j in range(len(x)):
+            # Symmetric: the rows are the columns.
+            _add(offset[j], mixture.precision[k, j], pull)
+        for i in range(len(x)):
+            exponent -= 0.5 * offset[i] * pull[i]
         share[k] = exponent
         most = max(most, exponent)
     total = math.exp(-mixture.nu - most)
-    for k in range(len(mixture.height)):
+    for k in range(len(share)):
         share[k] = math.exp(share[k] - most)
         total += share[k]
-    for k in range(len(mixture.height)):
+    for k in range(len(share)):
         share[k] /= total
     return -(most + math.log(total))
 
@@ -115,17 +115,24 @@ def _mixture_slopes(
     mixture: Mixture, scratch: PriorScratch, gradient: Array, hessian: Array
 ) -> None:
     """Add the derivatives of the cost about the mixture before."""
-    size, weight = len(gradient), mixture.weight
-    share, pulls, slope = scratch.share, scratch.pulls, scratch.pull
-    for i in range(size):
-        slope[i] = 0.0
+    weight, share, pulls, slope = mixture.weight, scratch.share, scratch.pulls, scratch.pull
+    row = scratch.row
+    slope[:] = 0.0
+    for k in range(len(share)):
+        _add(share[k], pulls[k], slope)
+    _add(weight, slope, gradient)
+    for i in range(len(slope)):
+        for j in range(len(slope)):
+            row[j] = slope[i] * slope[j]
         for k in range(len(share)):
-            slope[i] += share[k] * pulls[k, i]
-    for i in range(size):
-        gradient[i] += weight * slope[i]
-        for j in range(size):
-            entry = slope[i] * slope[j]
-            for k in range(len(share)):
-                bend = mixture.precision[k, i, j] - pulls[k, i] * pulls[k, j]
-                entry += share[k] * bend
-            hessian[i, j] += weight * entry
+            precision, pull, own, part = mixture.precision[k, i], pulls[k], pulls[k, i], share[k]
+            for j in range(len(row)):
+                row[j] += part * (precision[j] - own * pull[j])
+        _add(weight, row, hessian[i])
+
+
+@inlined
+def _add(share: float, one: Array, total: Array) -> None:
+    """Add a row in its share."""
+    for i in range(len(total)):
+        total[i] += share * one[i]

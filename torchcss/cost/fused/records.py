@@ -201,13 +201,14 @@ Attributes:
 """
 
 
-PriorScratch = namedtuple("PriorScratch", "pull share pulls")
+PriorScratch = namedtuple("PriorScratch", "pull share pulls row")
 """Memory for `add_priors`.
 
 Attributes:
-    pull: A gradient, `[n]`.
+    pull: An offset, or a gradient, `[n]`.
     share: Each mode's share in the mixture before, `[k]`.
     pulls: The gradient about each mode, `[k n]`.
+    row: A row of a Hessian, `[n]`.
 """
 
 
