@@ -173,7 +173,7 @@ def _reduced(
         whole[window.pixels] = ratio
         reduced[:-1] = functional.adaptive_avg_pool2d(whole[None], (height, width))[0]
         return reduced
-    left, top, right, bottom = window
+    left, top, right, bottom = window[:4]
     blocks = functional.pad(ratio, (left % side, -right % side, top % side, -bottom % side))
     rows = blocks.unflatten(1, (-1, side)).sum(2)  # rows first: three times as fast
     part = rows.unflatten(2, (-1, side)).sum(3) / side**2

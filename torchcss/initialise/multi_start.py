@@ -273,7 +273,9 @@ def _distinct_trunks(cost: TrackingCost, segments: Segments, x: Vectors, num: in
     return x[kept]
 
 
-def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, num: int) -> Vectors:
+def flips(
+    cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, num: int, steps: int = 15
+) -> Vectors:
     """The best combinations of forward-backward flips of some poses, their angles solved for.
 
     Args:
@@ -282,6 +284,7 @@ def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, nu
         x: The poses.
         bounds: Box limits.
         num: How many states to return, at the most.
+        steps: How long each is looked for.
     """
     body, device = cost.body, x.device
     # The hand of a body moves with its forearm; that of an arm has joints of its own.
@@ -306,7 +309,7 @@ def flips(cost: TrackingCost, segments: Segments, x: Vectors, bounds: Bounds, nu
         sigma=target.new_full(target.shape[-2:-1], _ON_PLACE),
     )
     start = x[:, None, None].expand(*shape, -1).flatten(0, 2)
-    solved = TrustRegionNewton(max_steps=15, tolerance=0.1).ends(reach, start, bounds)
+    solved = TrustRegionNewton(max_steps=steps, tolerance=0.1).ends(reach, start, bounds)
     return _best_combinations(
         widened(cost, 1.5 * _MIDDLE), segments, solved.unflatten(0, (-1, len(ways[1]))), num
     )

@@ -35,6 +35,9 @@ limits leave nearly no flip, what they leave looks different, and a descent from
 _ALL = 1_000_000
 """More combinations than any body has."""
 
+_STEPS = 8
+"""Steps towards a flip: nearly all are within 5 cm then, and are descended from afterwards."""
+
 _AT_ONCE = 128
 """Combinations that are posed at a time; the first few hundred of thousands mostly do."""
 
@@ -93,7 +96,7 @@ def flipped_poses(body: BodyModel, camera: Camera, x: Vector, *, num: int) -> Ve
         views=(FrameContext(body=body, camera=camera, keypoints=keypoints),),
     )
     kept, where = nothing, joints.new_zeros(0, *joints.shape)
-    for poses in flips(cost, segments, x[None], body.bounds, _ALL).split(_AT_ONCE):
+    for poses in flips(cost, segments, x[None], body.bounds, _ALL, _STEPS).split(_AT_ONCE):
         places = body.pose(poses).joints
         missed = torch.where(valid, (camera.project(places).uv - uv).norm(dim=-1), 0.0).amax(-1)
         differs = (places - joints).norm(dim=-1).amax(-1) >= POSES_APART

@@ -133,7 +133,8 @@ class Observer:
             return None
         uv = uv.reshape(-1, 2)
         least, greatest = uv.amin(0), uv.amax(0)
-        margin = _LEAST_MARGIN + _MARGIN * float((greatest - least).max())
+        motion = _MARGIN * float((greatest - least).max())
+        margin = _LEAST_MARGIN + motion
         width, height = self.costs.camera.image_size_wh
         left, top = (max(0, int(edge - margin)) for edge in least.tolist())
         right, bottom = (
@@ -142,7 +143,7 @@ class Observer:
         )
         if right - left < _LEAST_MARGIN or bottom - top < _LEAST_MARGIN:
             return None
-        return Window(left, top, right, bottom)
+        return Window(left, top, right, bottom, int(motion / 2))
 
     def recall(self, memory: ViewMemory, seen: ViewObservation) -> ViewMemory:
         """What is known still holds for a frame: the background of another scene does not."""

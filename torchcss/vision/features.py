@@ -65,12 +65,27 @@ class Window(NamedTuple):
         top: First row.
         right: Column after the last.
         bottom: Row after the last.
+        spare: So many pixels at each side are for the motion to the coming frame alone: what is
+            looked at was inside the rest in the frame before.
     """
 
     left: int
     top: int
     right: int
     bottom: int
+    spare: int = 0
+
+    def before(self, height: int, width: int) -> Window:
+        """Where it was in the frame before, of an image of a size.
+
+        What is cut off by the image's end keeps its place: how much is, is not known.
+        """
+        return Window(
+            self.left + (self.spare if self.left > 0 else 0),
+            self.top + (self.spare if self.top > 0 else 0),
+            self.right - (self.spare if self.right < width else 0),
+            self.bottom - (self.spare if self.bottom < height else 0),
+        )
 
     @property
     def pixels(self) -> tuple[EllipsisType, slice, slice]:
@@ -261,6 +276,9 @@ class FeatureExtractor(nn.Module):
     ) -> FrameFeatures:
         """Add flow, outlier map and motion boundaries."""
         grey, window = features.grey, features.window
+        if window is not None:
+            # Flow is of the pixels of the frame before.
+            window = window.before(*grey.shape)
         before, now = (
             picture if window is None else picture[window.pixels] for picture in (previous, grey)
         )
