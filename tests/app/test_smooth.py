@@ -145,6 +145,15 @@ def test_the_acceleration_ratio_and_the_persistence_do_what_they_say(body: BodyM
     assert sizes[0][free] == pytest.approx(2 * sizes[1][free], rel=0.1)
 
 
+def test_a_frame_keeps_the_covariance_of_its_mode(body: BodyModel):
+    """What is wrong in all frames is not known better for their number."""
+    track, _ = noisy_track(body)
+    done = smooth_track(track, Smoothing(likelihood_power=0.5))
+    own = track.covariance[np.arange(len(track.frames)), done.modes]
+    assert np.array_equal(done.track.covariance[:, 0], own)
+    assert done.track.likelihood_power == track.likelihood_power
+
+
 def test_with_a_lag_no_frame_knows_more_than_so_many_after_it(body: BodyModel):
     track, truth = noisy_track(body)
     choice = Smoothing(likelihood_power=0.5, persistence=2.0, lag=4)

@@ -159,7 +159,7 @@ def _smoothed(
         cost=cost[:, None].numpy(),
         parent=parent,
         joints_world=joints[:, None].numpy(),
-        likelihood_power=1 / choice.persistence,
+        likelihood_power=1 / choice.persistence if choice.persistence else track.likelihood_power,
     )
     modes = first.modes.numpy()
     effect = {

@@ -32,8 +32,9 @@ class Smooth:
     """Fit the trajectory to the images of the run's cameras again; implied by --video."""
     likelihood_power: float | None = None
     """Power of what frames and motions say when modes are weighed; by default that of the track."""
-    persistence: float = Smoothing.persistence
-    """How many frames say as much, in the covariances, as one that is independent."""
+    persistence: float | None = None
+    """How many frames say as much, in the covariances, as one that is independent; by default each
+    keeps the covariance of its mode."""
     acceleration_ratio: float | None = None
     """Expected accelerations over expected velocities, 1/s; lower is smoother. 10 by default, 20
     with images."""

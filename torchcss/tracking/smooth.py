@@ -37,6 +37,9 @@ from torchcss.types import Trajectory, Vector, frozen
 
 _SAME_BASE = 1e-9
 
+_PERSISTENCE = 20.0
+"""How many frames say as much as one, of a frame that said nothing itself."""
+
 
 @frozen
 class Smoothing:
@@ -47,21 +50,27 @@ class Smoothing:
             the likelihood in the track.
         acceleration_ratio: Expected accelerations over expected velocities, 1/s; lower is smoother.
             For the modes of a tracker 10 is good, for images 20.
-        persistence: How many frames say as much, in the covariances, as one that is independent.
-            Smoothing averages the noise of single frames, but not what persists: the person's size,
-            their clothes.
+        persistence: How many frames say as much, in the covariances, as one that is independent;
+            None: what is wrong in a frame is wrong in all, so that each keeps the covariance of its
+            mode. Smoothing averages the noise of single frames, but not what persists: the person's
+            size, their clothes.
         lag: How many frames after each may say something of it; None: all.
     """
 
     likelihood_power: float | None = None
     acceleration_ratio: float = 10.0
-    persistence: float = 20.0
+    persistence: float | None = None
     lag: int | None = None
 
     def __post_init__(self) -> None:
         if self.lag is not None and self.lag < 0:
             raise ConfigurationError(f"lag: expected at least 0 frames, got {self.lag}")
         check_positive(self, "likelihood_power", "acceleration_ratio", "persistence", finite=True)
+
+    @property
+    def frames_as_one(self) -> float:
+        """So many frames count as one, at least in those that have no mode of their own."""
+        return self.persistence or _PERSISTENCE
 
 
 class TrackedModes(NamedTuple):
@@ -185,9 +194,14 @@ def _all_in_view(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         track.times,
         motion_prior(body, choice),
         free_turns(body),
-        choice=Refinement(likelihood_power=1 / (choice.persistence * track.likelihood_power)),
+        choice=Refinement(likelihood_power=1 / (choice.frames_as_one * track.likelihood_power)),
         changes=changes,
     )
+    if choice.persistence is None:
+        own = track.covariance[everywhere, mode]
+        refined = refined._replace(
+            covariance=torch.where(seen[:, None, None], own, refined.covariance)
+        )
     # The modes' covariances have the track's power, their costs are full nats.
     cost = cost[everywhere, mode] + refined.cost / track.likelihood_power
     return Smoothed(refined, cost, mode, seen)
@@ -199,7 +213,7 @@ def motion_prior(body: BodyModel, choice: Smoothing) -> Transition:
     Evidence counts by a power, for the covariances; so that this leaves the balance of evidence
     and motion as it is, the motion counts by it, too.
     """
-    rate = body.motion_rate * choice.persistence**0.5
+    rate = body.motion_rate * choice.frames_as_one**0.5
     return Transition(
         velocity=tuple(rate.tolist()),
         acceleration=tuple((choice.acceleration_ratio * rate).tolist()),

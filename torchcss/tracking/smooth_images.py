@@ -106,9 +106,11 @@ def smooth_modes_on_images(
         track.times,
         motion_prior(body, choice),
         free_turns(body),
-        choice=replace(IN_WINDOWS, likelihood_power=1 / choice.persistence),
+        choice=replace(IN_WINDOWS, likelihood_power=1 / choice.frames_as_one),
         changes=base_changes(body, track.bases),
     )
+    if choice.persistence is None:
+        refined = refined._replace(covariance=first.refined.covariance)
     return SmoothedOnImages(first, refined, torch.tensor(at_start, dtype=torch.float64))
 
 
