@@ -4,7 +4,7 @@ Little endian throughout: float32 202021.25 (its four bytes spell PIEH), int32 w
 then row by row the float32 pairs (u to the right, v down) in pixels. A component beyond 1e9 in
 size marks a pixel whose flow is not known.
 
-By default: `read_flow(path)`, then `flow_discontinuities` of what was read.
+By default: `read_flow(path)`, then `flow_discontinuities` of what was read; and `write_flow`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from torchcss.vision.flow import FlowConfiguration
 _MAGIC = b"PIEH"
 _HEADER_BYTES = 12
 _UNKNOWN_BEYOND = 1.0e9
+UNKNOWN = 1.666666752e9
+"""What Middlebury writes where a flow is not known."""
 
 
 class FlowFile(NamedTuple):
@@ -66,6 +68,16 @@ def read_flow(path: str | os.PathLike[str]) -> FlowFile:
     flow = torch.from_numpy(values.astype(np.float32)).movedim(-1, 0).contiguous()
     known = (flow.abs() <= _UNKNOWN_BEYOND).all(dim=0)  # false for NaN
     return FlowFile(torch.where(known, flow, 0.0), known)
+
+
+def write_flow(
+    path: Path, flow: Float[Tensor, "2 h w"], known: Bool[Tensor, "h w"] | None = None
+) -> None:
+    """Write a `.flo` file; what is not known, or not finite, as such."""
+    usable = flow.isfinite().all(0) if known is None else known & flow.isfinite().all(0)
+    values = torch.where(usable, flow.float(), UNKNOWN).movedim(0, -1).contiguous().numpy()
+    header = b"PIEH" + np.array(flow.shape[:0:-1], "<i4").tobytes()
+    path.write_bytes(header + values.astype("<f4").tobytes())
 
 
 def flow_discontinuities(

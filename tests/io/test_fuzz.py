@@ -18,10 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from common.flow_files import read_flow
+from common.flow_files import read_flow, write_flow
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from made_flows import write_flow
 from made_tracks import make_track
 from scipy.io import savemat
 

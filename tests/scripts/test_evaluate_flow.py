@@ -9,7 +9,7 @@ from types import ModuleType
 import matplotlib.image
 import pytest
 import torch
-from made_flows import write_flow
+from common.flow_files import write_flow
 
 from torchcss.errors import FlowFileError
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from common.flow_files import flow_discontinuities, read_flow
-from made_flows import write_flow
+from common.flow_files import flow_discontinuities, read_flow, write_flow
 
 from torchcss.errors import FlowFileError, ShapeError
 
