@@ -205,10 +205,10 @@ def robust_flow(
     textured = frames
     flow = frames.new_zeros(frames.shape[0], 2, 1, 1)
     for grey in _pyramid(frames, configuration):
-        size = grey.shape[-2:]
+        rows, columns = grey.shape[-2:]
         textured = grey - configuration.texture * _structure(grey)
-        scale = flow.new_tensor([size[1] / flow.shape[-1], size[0] / flow.shape[-2]])
-        flow = _enlarged(flow, size) * scale.view(1, 2, 1, 1)
+        scale = flow.new_tensor([columns / flow.shape[-1], rows / flow.shape[-2]])
+        flow = _enlarged(flow, (rows, columns)) * scale.view(1, 2, 1, 1)
         flow = _refine(flow, textured, grey[:, :1], configuration)
     data = _of_scale(configuration.data, _DATA_OUTLIER_SCALE)
     smoothness = _of_scale(configuration.smoothness, _SMOOTHNESS_OUTLIER_SCALE)
