@@ -1564,3 +1564,15 @@ def test_arrays_beside_the_size_of_the_video(tmp_path: Path, kind: str) -> None:
     np.savez(tmp_path / "a.npz", keypoints=stack, world=np.zeros_like(stack), fps=25.0,
              width=size[0], height=size[1])  # fmt: skip
     check(read(tmp_path / "a.npz"))
+
+
+@pytest.mark.parametrize("suffix", ["json", "jsonl", "ndjson", "txt"])
+def test_an_object_in_every_line(tmp_path: Path, suffix: str) -> None:
+    lines = [json.dumps({"frame": t, "body": [{"body_id": 4, "keypoints": dict(
+        zip(TFJS, person(t).tolist(), strict=True))}]}) for t in SEEN]  # fmt: skip
+    check(read(write(tmp_path / f"a.{suffix}", "\n".join(lines))), (3,))
+    path = write(tmp_path / f"a.{suffix}", "\n".join([*lines, "{"]))
+    with pytest.raises(KeypointError, match="nor one object in every line"):
+        read(path)
+    with pytest.raises(KeypointError, match=f"b.{suffix}: .*[Nn]o such file|missing"):
+        read(tmp_path / f"b.{suffix}")

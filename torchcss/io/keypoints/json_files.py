@@ -84,6 +84,8 @@ _OTHERS = {
 }
 """Files of other kinds by words in them, and what to do."""
 
+_BY_LINES = (".jsonl", ".ndjson", ".txt")
+
 _HUGE = 1e19
 """No number of a frame is so large, nor a time, were it in nanoseconds since 1970."""
 
@@ -194,7 +196,7 @@ def _load(path: Path) -> Any:
             return content
         lines = content
     except KeypointError as error:
-        if "Extra data" not in str(error):
+        if "Extra data" not in str(error) and path.suffix.lower() not in _BY_LINES:
             raise
         lines = read_text(path, KeypointError).splitlines()
     try:
