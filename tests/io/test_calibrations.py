@@ -438,6 +438,28 @@ def test_an_inverse_model_is_refused_unless_it_is_none(tmp_path: Path) -> None:
         load_camera(tmp_path / "a.json")
 
 
+def test_a_folder_of_arrays(tmp_path: Path) -> None:
+    np.save(tmp_path / "camera_matrix.npy", K)
+    np.save(tmp_path / "dist_coeffs.npy", [LENS])
+    np.save(tmp_path / "image_size.npy", SIZE)
+    check(tmp_path)
+    (tmp_path / "dist_coeffs.npy").write_text("x")
+    with pytest.raises(CameraError, match=r"dist_coeffs\.npy: not an NPY file"):
+        load_camera(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "words", ["mtx_l dist_l mtx_r", "Kl Dl Kr", "K1 D1 K2", "K_left D_left K_right"]
+)
+def test_a_pair_beside_what_rectifies_it(tmp_path: Path, words: str) -> None:
+    one, lens, other = words.split()
+    arrays = {one: K, lens: [LENS], other: np.eye(3), "R": np.eye(3), "T": [[1], [0], [0]],
+              "R1": np.eye(3), "R2": np.eye(3), "P1": np.ones((3, 4)), "P2": np.ones((3, 4)),
+              "Q": np.eye(4), "imageSize": SIZE}  # fmt: skip
+    np.savez(tmp_path / "a.npz", **{word: np.array(array) for word, array in arrays.items()})
+    check(tmp_path / "a.npz", name=re.sub("^K_?|^mtx_", "", one))
+
+
 def test_sides_of_a_pair(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", mtxL=K, distL=LENS, mtxR=K, distR=[0] * 5, imageSize=SIZE)
     check(tmp_path / "a.npz", name="L")

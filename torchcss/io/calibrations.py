@@ -193,6 +193,10 @@ def _read_folder(path: Path) -> dict[str, Entry]:
         raise CameraError(
             f"{path}: no calibration in this folder; expected {names} or a file for every camera"
         )
+    if len(files) > 1 and files[0].suffix.lower() == ".npy":  # an array each
+        with naming(path, CameraError):
+            arrays = {file.stem: load_array(file, CameraError).tolist() for file in files}
+            return _read_content(path, arrays)
     found: dict[str, Entry] = {}
     for file in files:
         for name, entry in read_entries(file).items():
@@ -422,14 +426,15 @@ def _numbered(values: object) -> dict[str, dict[str, Any]]:
     """Cameras whose number or side ends the names of their numbers, as in `M1`, `distL`."""
     found: dict[str, dict[str, Any]] = {}
     for key, value in values.items() if isinstance(values, Mapping) else ():
-        if named := re.fullmatch(r"([A-Za-z]\w*?)_?([0-9]+|[LR]|(?<=_)left|(?<=_)right)", str(key)):
-            found.setdefault(named[2], {})[named[1]] = value
-    pair = {
-        name: own
-        for name, own in found.items()
-        if isinstance(first_of(own, (*_WORDS["K"], *_PROJECTIONS)), (list, dict))
-    }
-    return {name: {**values, **own} for name, own in pair.items()}  # type: ignore[dict-item]
+        if match := re.fullmatch(
+            r"([A-Za-z]\w*?)_?([0-9]+|[LRlr]|(?<=_)left|(?<=_)right)", str(key)
+        ):
+            found.setdefault(match[2], {})[match[1]] = value
+    for words in (_WORDS["K"], _PROJECTIONS):  # beside K those are of the rectified pictures
+        named = [n for n, own in found.items() if isinstance(first_of(own, words), (list, dict))]
+        if named:
+            return {n: {**values, **found[n]} for n in named}  # type: ignore[dict-item]
+    return {}
 
 
 def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
