@@ -32,7 +32,9 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
             assert max(-low, high) <= 4.0 * row["deviation"] * (1 + 1e-9)
         for term in row["terms"].values():
             assert term["num_minima"] <= term["num_minima_raw"]
-            assert term["largest_jump_twice_density"] <= term["largest_jump"] * (1 + 1e-9) <= 1.0
+            # A sample more between two may be in a dip, and parts their difference otherwise.
+            assert term["largest_jump"] <= 1.0
+            assert term["largest_jump"] <= 2 * term["largest_jump_twice_density"] * (1 + 1e-9)
     table = {(row["term"], row["scale"]): row for row in frame["table"]}
     # Smooth terms: what is left of their steepest steps is nothing.
     for name in ("flow", "stabiliser"):
