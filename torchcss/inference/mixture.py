@@ -310,8 +310,11 @@ def separated(
     """
     left = torch.ones(len(landmarks), dtype=torch.bool, device=landmarks.device)
     chosen: list[int] = []
-    while len(chosen) < num and bool(left.any()):
-        best = int(left.int().argmax())
+    while len(chosen) < min(num, len(landmarks)):
+        # One number in a transfer: the best that is left, or none.
+        best = int(torch.where(left.any(), left.int().argmax(), -1))
+        if best < 0:
+            break
         chosen.append(best)
         left[best] = False
         left &= (landmarks - landmarks[best]).norm(dim=-1).amax(-1) >= distance

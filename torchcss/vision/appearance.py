@@ -146,7 +146,11 @@ def _counts(bins: Int[Tensor, "h w"], masks: Bool[Tensor, "layers h w"]) -> Tens
         counts = torch.zeros(len(masks), BINS**3, dtype=torch.long)
         run(count_bins, bins.contiguous(), masks.contiguous(), counts)
         return counts
-    return torch.stack([torch.bincount(bins[mask], minlength=BINS**3) for mask in masks])
+    # `bincount` would have the host wait for the greatest bin.
+    counts = torch.zeros(len(masks), BINS**3, dtype=torch.long, device=masks.device)
+    return counts.scatter_add_(
+        1, bins.flatten().long().expand(len(masks), -1), masks.flatten(1).long()
+    )
 
 
 def _smooth(histograms: Histograms) -> Histograms:
