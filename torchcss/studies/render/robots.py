@@ -117,6 +117,7 @@ def robot_sequence(
     middle: Vector | None = None,
     amplitude: float = 0.5,
     num_frames: int = 50,
+    frame_rate: float = 25.0,
 ) -> SyntheticSequence:
     """Film an arm that moves before clutter.
 
@@ -125,11 +126,12 @@ def robot_sequence(
         generator: Source of the motion, the background, the paint and the sensor noise.
         middle: See `swing`.
         amplitude: See `swing`.
-        num_frames: Number of frames, 25 per second.
+        num_frames: Number of frames.
+        frame_rate: Frames per second.
     """
-    times = torch.arange(num_frames, dtype=torch.float64) / 25
+    times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
     states = swing(body, times, generator=generator, middle=middle, amplitude=amplitude)
-    (sequence,) = film_robot(body, states, generator=generator)
+    (sequence,) = film_robot(body, states, generator=generator, frame_rate=frame_rate)
     return sequence
 
 
