@@ -330,3 +330,23 @@ def test_whole_numbers_shrink_as_their_twin_in_torch(
     for got, kind in zip(compiled, kinds, strict=True):
         assert got is not None
         torch.testing.assert_close(got, extractor(kind).colour, rtol=0, atol=1e-6)
+
+
+def test_flow_is_looked_for_where_the_window_was_in_the_frame_before(
+    generator: torch.Generator,
+) -> None:
+    """Less what may have come in since; what the image cuts off is kept."""
+    assert Window(0, 5, 100, 200, spare=4).before(200, 300) == Window(0, 9, 96, 200)
+    texture = gaussian_blur(torch.rand(60, 82, generator=generator), 1.5)
+    texture = (texture - texture.min()) / (texture.max() - texture.min())
+    extractor, window = FeatureExtractor(flow=TRACKING_FLOW), Window(10, 0, 70, 50, spare=8)
+    features = extractor(texture[:, 1:-1], texture[:, :-2], window=window)
+    inside = torch.zeros(60, 80, dtype=torch.bool)
+    inside[window.before(60, 80).pixels] = True
+    assert features.flow is not None
+    assert features.flow_outlier is not None
+    assert float((features.flow[0, inside] + 1).abs().median()) < 0.2
+    assert not bool(features.flow[:, ~inside].any())
+    assert bool((features.flow_outlier[~inside] == 1).all())
+    # Edges are looked for in all of it.
+    assert bool(features.edge_energy[0:50, 10:18].any())
