@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.total import TrackingCost
-from torchcss.io.tracks import prepare_output_folder
+from torchcss.files import prepare_output_folder
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots

@@ -30,8 +30,8 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 
 from torchcss.body.root import ROOT_NAMES
+from torchcss.files import prepare_output_folder
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.tracks import prepare_output_folder
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
 from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes, sequence_scenes

@@ -32,11 +32,11 @@ from common import start
 from PIL import Image
 
 from torchcss.errors import ConfigurationError
+from torchcss.files import prepare_output_folder, save_arrays
 from torchcss.io.cameras import read_camera
-from torchcss.io.tracks import prepare_output_folder
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.joint_names import canonical_joint_name
-from torchcss.studies.sequence_writer import write_arrays, write_camera
+from torchcss.studies.sequence_writer import write_camera
 from torchcss.vision.camera import Camera
 
 SHORT_SIDE, OUTLIERS, SWAPPED = 160, 0.15, 5
@@ -95,8 +95,8 @@ class Clip:
         write_camera(folder / "cameras.json", self.camera)
         known = {"keypoints": self.keypoints, "confidence": self.confidence}
         named = {"joint_names": self.joints, "frame_rate": self.frame_rate}
-        write_arrays(folder / "keypoints2d.npz", known | named)
-        write_arrays(folder / "reference3d.npz", self.reference)
+        save_arrays(folder / "keypoints2d.npz", known | named)
+        save_arrays(folder / "reference3d.npz", self.reference)
 
     def without(self, gone: np.ndarray) -> Clip:
         """The same without some of the keypoints."""

@@ -26,11 +26,11 @@ from common import Table, finish, peak_mib, start
 from torchcss.app.recorder import Picture
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.cli.options import SettingsOptions
+from torchcss.files import save_arrays
 from torchcss.io.keypoints.read import OWN_NAMES
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.studies.demo import CLIP, DEMO_SETTINGS
-from torchcss.studies.sequence_writer import write_arrays
 from torchcss.tracking.session import Posterior
 from torchcss.types import Frame
 
@@ -142,7 +142,7 @@ def _keypoints_for(num_frames: int, folder: Path) -> Path:
         rows[0] = known[name][0]
         known[name] = rows
     path = folder / "keypoints.npz"
-    write_arrays(path, known)
+    save_arrays(path, known, compressed=True)
     return path
 
 

@@ -32,8 +32,9 @@ from torch import Tensor
 
 from torchcss.body.load import load_body
 from torchcss.errors import ConfigurationError
+from torchcss.files import prepare_output_folder, save_arrays
 from torchcss.io.motion.positions import read_motion_capture, resample_motion
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.io.tracks import write_summary
 from torchcss.solve.retarget import retarget
 from torchcss.studies.random_person import random_lengths
 from torchcss.studies.render.motions import Motion
@@ -46,7 +47,7 @@ from torchcss.studies.render.sequences import (
     camera_in_front,
     shot_of_motion,
 )
-from torchcss.studies.sequence_writer import write_arrays, write_sequence
+from torchcss.studies.sequence_writer import write_sequence
 
 PATTERNS = ("plaid", "stripes", "plain")
 
@@ -200,7 +201,7 @@ def detected(config: Config, folder: Path, seed: int) -> None:
     noise = detector_noise(config, hidden, generator=generator) * height
     arrays["keypoints"] = (exact + noise).numpy()
     arrays["noise_px"] = np.array(height * math.hypot(config.offset, config.jitter))
-    write_arrays(folder / "keypoints2d.npz", arrays)
+    save_arrays(folder / "keypoints2d.npz", arrays)
 
 
 def detector_noise(

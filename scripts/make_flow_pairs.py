@@ -36,7 +36,7 @@ from common.flow_files import write_flow
 from jaxtyping import Bool, Float
 from PIL import Image
 
-from torchcss.io.tracks import prepare_output_folder
+from torchcss.files import prepare_output_folder
 
 Places = Float[np.ndarray, "h w 2"]
 

@@ -57,7 +57,8 @@ from peers.tracker_step import (
 )
 
 from torchcss.errors import ConfigurationError
-from torchcss.io.tracks import prepare_output_folder
+from torchcss.files import prepare_output_folder
+from torchcss.show.style import save_figure
 from torchcss.tracking.settings import Settings
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -208,7 +209,7 @@ def main(config: Config) -> dict[str, Any]:
               f"{max(row['relative_difference'].values()):.1e}", flush=True)  # fmt: skip
     report = {"rows": rows, "config": config, "torch": torch.__version__}
     if config.folder is not None:
-        picture(rows).savefig(config.folder / "profile.png", dpi=100)
+        save_figure(picture(rows), config.folder / "profile.png", dpi=100)
     title = f"A step eager, compiled and fused, {config.dtype} on {config.device}"
     columns = ("body", "microseconds", "times as fast", "MiB", "library's share")
     table = Table(title, columns, [cells_of(row, name) for row in rows for name in _ways(row)])

@@ -33,12 +33,12 @@ from common import Table, start, write_report
 from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
-from torchcss.files import replace_file
+from torchcss.files import prepare_output_folder, save_arrays
 from torchcss.io.motion.positions import MotionCapture, read_motion_capture, resample_motion
-from torchcss.io.tracks import prepare_output_folder
+from torchcss.show.style import save_figure
 from torchcss.solve.retarget import Retargeted, retarget
-from torchcss.studies import sequence_writer
 from torchcss.studies.render.motions import Motion
+from torchcss.studies.sequence_writer import write_motion
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +106,7 @@ def main(config: Config) -> dict[str, Any]:
     )
     write_report(config.report, report, table)
     if config.picture is not None:
-        with replace_file(config.picture) as partial:
-            picture(motion, result).savefig(partial, dpi=80)
+        save_figure(picture(motion, result), config.picture, dpi=80)
     return report
 
 
@@ -147,7 +146,7 @@ def report_of(
 
 def write_retargeted(path: Path, config: Config, result: Retargeted) -> None:
     description = f"motion capture {config.file.name} from {config.start:g} s on"
-    sequence_writer.write_motion(
+    write_motion(
         path,
         Motion(result.body, result.states, config.rate, description),
         {
@@ -176,7 +175,7 @@ def write_reference(path: Path, config: Config, result: Retargeted) -> None:
         "time_s": np.arange(len(joints)) / config.rate,
         "units": "m",
     }
-    sequence_writer.write_arrays(path, found)
+    save_arrays(path, found)
 
 
 def picture(motion: MotionCapture, result: Retargeted, columns: int = 7) -> Figure:

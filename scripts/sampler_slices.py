@@ -28,11 +28,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from torch import Tensor
 
+from torchcss.files import prepare_output_folder
 from torchcss.inference.mixture import GaussianMixture, distinct_modes
 from torchcss.inference.proposals import ChamRehg, Condensation, CovarianceScaled, Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
-from torchcss.io.tracks import prepare_output_folder
 from torchcss.linalg import squared_mahalanobis
+from torchcss.show.style import save_figure
 from torchcss.studies.sampling_study import StudyChoice, study_problem
 from torchcss.types import Bounds, CostFunction, LocalModel, Status
 
@@ -173,7 +174,7 @@ def main(config: Config) -> dict[str, Any]:
     table.print()
     if config.out is not None:
         folder = prepare_output_folder(config.out)
-        picture(config, plane, own, noise, runs).savefig(folder / "fig8d.png", dpi=90)
+        save_figure(picture(config, plane, own, noise, runs), folder / "fig8d.png", dpi=90)
         write_report(folder / "sampler_slices.json", report, table)
     write_report(config.report, report, table)
     return report

@@ -35,8 +35,7 @@ from matplotlib.figure import Figure
 from torchcss.errors import ConfigurationError
 from torchcss.files import load_json, real_numbers
 from torchcss.inference.proposals import CovarianceScaled, Spherical
-from torchcss.io.tracks import prepare_output_folder
-from torchcss.show.style import OKABE_ITO
+from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies.reprojection import ReprojectionProblem
 from torchcss.studies.sampling_study import (
     Lengths,
@@ -189,7 +188,6 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
     starts = {name: make_problem(config, seed, name).start for name in ("arm8", "body32")}
     spectra = {name: spectrum(start.covariance).tolist() for name, start in starts.items()}
     if config.figures is not None:
-        folder = prepare_output_folder(config.figures)
         title = f"{config.body}, seed {seed}, scale {config.scales[-1]:g}, {config.samples} samples"
         figures = {
             "fig1": minima_and_costs_figure(last, title),
@@ -197,7 +195,7 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
             "fig13": samples_and_minima_figure(last, title),
         }
         for name, figure in figures.items():
-            figure.savefig(folder / f"{name}_seed{seed}.png", dpi=90)
+            save_figure(figure, config.figures / f"{name}_seed{seed}.png", dpi=90)
     ratio = {name: values[0] / values[-1] for name, values in spectra.items()}
     return {"seed": seed, "spectrum_ratio": ratio, "start_cost": float(problem.start.cost),
             "seconds": sum(row["seconds"] for row in rows), "rows": rows}  # fmt: skip

@@ -31,7 +31,8 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
-from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
+from torchcss.files import prepare_output_folder
+from torchcss.io.tracks import load_track, write_summary
 from torchcss.solve.inverse_kinematics import link_pose, pose_errors
 from torchcss.studies.demo import track_sequence
 from torchcss.studies.render.robots import robot_arm, robot_sequence

@@ -85,19 +85,20 @@ def replace_file(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
-def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+def save_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
     """Write an NPZ file whole or not at all.
 
     Args:
         path: The file.
         arrays: Arrays by name, or what NumPy makes arrays of.
+        compressed: For large arrays of few values, such as masks; it takes time.
 
     Raises:
         OutputError: If it cannot be written.
     """
     plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
     with replace_file(path) as partial:
-        np.savez(partial, **plain)
+        (np.savez_compressed if compressed else np.savez)(partial, **plain)
 
 
 def extend_arrays(path: Path, arrays: Mapping[str, Any], fill: Mapping[str, float]) -> None:

@@ -20,7 +20,8 @@ import numpy as np
 import tyro
 
 from torchcss.errors import ConfigurationError, TorchcssError
-from torchcss.io.tracks import prepare_output_folder, write_summary
+from torchcss.files import prepare_output_folder
+from torchcss.io.tracks import write_summary
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

@@ -200,7 +200,7 @@ def test_a_motion_file_is_read_as_it_was_meant(tmp_path: Path) -> None:
         "states": np.zeros((5, body.num_parameters)),
         "frame_rate": np.array(60.0),
         "lengths": np.array(json.dumps({"thigh": 0.4})),
-        "base_transform": base.numpy(),
+        "base_transform": base.int().numpy(),
         "description": np.array("standing"),
     }
     np.savez(tmp_path / "file.npz", **arrays)
@@ -215,6 +215,12 @@ def test_a_motion_file_is_read_as_it_was_meant(tmp_path: Path) -> None:
         ({"states": np.zeros((5, 3))}, "frames', 34\\]"),
         ({"frame_rate": np.array(0.0)}, "positive frame_rate"),
         ({"lengths": np.array("no json")}, "no motion of a body of ours"),
+        ({"base_transform": np.diag([2.0, 1, 1, 1])}, "broken.npz: no motion.*a rotation"),
+        ({"base_transform": np.full((4, 4), np.inf)}, "broken.npz: no motion.*a rotation"),
+        (
+            {"base_transform": base.numpy() + np.diag([0, 0, 0, np.nan])},
+            "base_transform: expected finite",
+        ),
     ):
         broken = {k: v for k, v in {**arrays, **change}.items() if v is not None}
         np.savez(tmp_path / "broken.npz", **broken)

@@ -28,7 +28,7 @@ from torchcss.app.view_files import FrameSelection, OpenView, moments, open_run,
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError
-from torchcss.files import StrPath, naming
+from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
 from torchcss.initialise.result import Initialisation, scale_of
@@ -37,7 +37,7 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fi
 from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run, as_run
-from torchcss.io.tracks import TRACK_NAME, prepare_output_folder
+from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader
 from torchcss.io.view_files import ViewFiles
 from torchcss.joint_names import JOINT_NAMES

@@ -61,7 +61,6 @@ from torchcss.files import (
     save_arrays,
     write_text,
 )
-from torchcss.files import prepare_output_folder as prepare_output_folder
 from torchcss.io.track_body import body_from_plain, body_to_plain
 from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
 

@@ -26,16 +26,17 @@ import torch
 
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.errors import ConfigurationError
+from torchcss.files import prepare_output_folder, save_arrays
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
 from torchcss.io.fitted_body import write_fitted_body
 from torchcss.io.keypoints.read import OWN_NAMES
-from torchcss.io.tracks import load_track, prepare_output_folder, write_summary
+from torchcss.io.tracks import load_track, write_summary
 from torchcss.io.video import VideoWriter
 from torchcss.studies.metrics import mpjpe_mm
 from torchcss.studies.render.sequences import SyntheticSequence
-from torchcss.studies.sequence_writer import write_arrays, write_camera
+from torchcss.studies.sequence_writer import write_camera
 from torchcss.studies.sequences import read_reference
 from torchcss.tracking.settings import Settings
 from torchcss.types import Keypoints
@@ -120,7 +121,7 @@ def write_clip(
     first, seen = _first_pose(sequence, generator)
     # A keypoint file tells all frames; nothing is known of the later ones.
     later = (len(sequence.frames) - 1, *seen.positions.shape[1:])
-    write_arrays(
+    save_arrays(
         folder / "keypoints.npz",
         {
             "keypoints": torch.cat([seen.positions, torch.zeros(later)]),
@@ -129,7 +130,7 @@ def write_clip(
         },
     )
     write_fitted_body(folder / "body.npz", first, sequence.camera)
-    write_arrays(
+    save_arrays(
         folder / "reference3d.npz",
         {
             "joints": sequence.joints_world.double().cpu(),

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.files import StrPath, prepare_output_folder, replace_file, write_text
+from torchcss.files import StrPath, prepare_output_folder, replace_file, save_arrays, write_text
 from torchcss.io.cameras import camera_entry
 from torchcss.io.video import VideoWriter
 from torchcss.studies.render.motions import Motion
@@ -97,7 +97,7 @@ def _write_frames(folder: Path, shot: Shot, frames: Iterable[SequenceFrame]) -> 
                 joints.append((frame.joints, frame.uv, frame.visible, frame.in_image))
         with archive.open("occluded.npy", "w", force_zip64=True) as stream:
             np.lib.format.write_array(stream, occluded, allow_pickle=False)
-    write_arrays(folder / "mask.npz", {"mask": mask})
+    save_arrays(folder / "mask.npz", {"mask": mask}, compressed=True)
     return [torch.stack(part) for part in zip(*joints, strict=True)]
 
 
@@ -106,7 +106,7 @@ def _write_joints(folder: Path, shot: Shot, joints: list[Tensor], noise_px: floa
     # Its own generator: the noise of the keypoints does not depend on how the picture was made.
     generator = torch.Generator().manual_seed(shot.seed + 1)
     noise = torch.randn(exact.shape, generator=generator, dtype=exact.dtype)
-    write_arrays(
+    save_arrays(
         folder / "keypoints2d.npz",
         {
             "keypoints": exact + noise_px * noise,
@@ -119,7 +119,7 @@ def _write_joints(folder: Path, shot: Shot, joints: list[Tensor], noise_px: floa
             "noise_px": noise_px,
         },
     )
-    write_arrays(
+    save_arrays(
         folder / "reference3d.npz",
         {
             "joints": places,
@@ -164,10 +164,4 @@ def write_motion(path: Path, motion: Motion, more: Mapping[str, Any]) -> None:
         "frame_rate": motion.frame_rate,
         "description": motion.description,
     }
-    write_arrays(path, {**known, **more})
-
-
-def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays by name, or what NumPy makes arrays of."""
-    with replace_file(path) as partial, partial.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)
+    save_arrays(path, {**known, **more})

@@ -115,7 +115,7 @@ def read_sequence(folder: StrPath, *, view: str | None = None) -> RecordedSequen
         keypoints=keypoints,
         keypoint_noise_px=noise,
         joint_names=tuple(names),
-        joints_world=joints.astype(np.float64),
+        joints_world=joints,
         mask=_read_mask(mask_file, (num_frames, size[1], size[0])) if mask_file.exists() else None,
         truth=read_motion(truth_file, frame_rate=frame_rate, num_frames=num_frames)
         if truth_file.exists()
@@ -187,7 +187,7 @@ def read_reference(
         )
     _require(path, arrays, "joint_names")
     names = [common_name(str(name)) for name in arrays["joint_names"].reshape(-1)]
-    joints = _array(path, arrays, array, (num_frames, len(names), 3), "f")
+    joints = _array(path, arrays, array, (num_frames, len(names), 3))
     units = str(arrays.get("units", "m"))
     if units.lower() not in ("m", "metre", "metres", "meter", "meters"):
         raise TrackFileError(f"{path}: units: expected metres, got {units!r}; convert the file")
@@ -202,7 +202,7 @@ def common_name(name: str) -> str:
 def _read_mask(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
     arrays = load_arrays(path, TrackFileError)
     _require(path, arrays, "mask")
-    return _array(path, arrays, "mask", shape, "b")
+    return _array(path, arrays, "mask", shape, numbers=False)
 
 
 def read_motion(
@@ -221,13 +221,16 @@ def read_motion(
     arrays = load_arrays(path, TrackFileError)
     needed = ("body", "state_names", "states", *(("frame_rate",) if frame_rate is None else ()))
     _require(path, arrays, *needed)
+    base = np.eye(4)
+    if "base_transform" in arrays:
+        base = _array(path, arrays, "base_transform", (4, 4))
+    turn, place = torch.from_numpy(base[:3, :3]), torch.from_numpy(base[:3, 3])
     try:
         lengths = json.loads(str(arrays.get("lengths", "{}")))
-        body = load_body(
-            str(arrays["body"]), lengths={str(k): float(v) for k, v in lengths.items()}
-        )
+        lengths = {str(k): float(v) for k, v in lengths.items()}
+        body = load_body(str(arrays["body"]), lengths=lengths).with_base(turn, place)
         rate = float(arrays["frame_rate"] if frame_rate is None else frame_rate)
-    except (ValueError, AttributeError, TypeError) as error:  # ValueError: JSON's and BodyError
+    except (ValueError, AttributeError, TypeError) as error:  # ValueError: JSON's and ours
         raise TrackFileError(f"{path}: no motion of a body of ours: {one_line(error)}") from error
     names = tuple(str(name) for name in arrays["state_names"].reshape(-1))
     if names != body.state_names:
@@ -235,19 +238,12 @@ def read_motion(
             f"{path}: state_names: expected those of {body.name}, {', '.join(body.state_names)}; "
             f"found {', '.join(names)}"
         )
-    base = np.eye(4)
-    if "base_transform" in arrays:
-        base = _array(path, arrays, "base_transform", (4, 4), "f").astype(np.float64)
-    states = _array(path, arrays, "states", (num_frames, len(names)), "f").astype(np.float64)
-    if not (rate > 0 and len(states) and np.isfinite(states).all()):
-        raise TrackFileError(f"{path}: states: expected finite numbers and a positive frame_rate")
-    turn, place = torch.from_numpy(base[:3, :3]), torch.from_numpy(base[:3, 3])
-    return Motion(
-        body.with_base(turn, place),
-        torch.from_numpy(states),
-        rate,
-        str(arrays.get("description", "")),
-    )
+    states = _array(path, arrays, "states", (num_frames, len(names)))
+    if not (rate > 0 and len(states) and np.isfinite(states).all() and np.isfinite(base).all()):
+        raise TrackFileError(
+            f"{path}: states, base_transform: expected finite numbers and a positive frame_rate"
+        )
+    return Motion(body, torch.from_numpy(states), rate, str(arrays.get("description", "")))
 
 
 def _require(path: Path, arrays: Mapping[str, np.ndarray], *names: str) -> None:
@@ -264,17 +260,18 @@ def _array(
     arrays: Mapping[str, np.ndarray],
     name: str,
     shape: tuple[int | None, ...],
-    kind: str,
+    *,
+    numbers: bool = True,
 ) -> np.ndarray:
-    """The array, if it is of this shape (None: any), and floating point (`f`) or boolean (`b`)."""
+    """The array, if it is of this shape (None: any), as float64; without numbers, truth values."""
     array = arrays[name]
     fits = len(array.shape) == len(shape) and all(
         size in (None, found) for size, found in zip(shape, array.shape, strict=True)
     )
-    if not fits or array.dtype.kind != kind:
+    if not fits or array.dtype.kind not in ("fiu" if numbers else "b"):
         raise TrackFileError(
-            f"{path}: {name}: expected {'truth values' if kind == 'b' else 'numbers'}, expected "
-            f"shape {[size or 'frames' for size in shape]}, as many frames as the video has; found "
+            f"{path}: {name}: expected {'numbers' if numbers else 'truth values'} of the shape "
+            f"{[size or 'frames' for size in shape]}, for as many frames as the video has; found "
             f"{array.dtype} {list(array.shape)}"
         )
-    return array
+    return array.astype(np.float64) if numbers else array

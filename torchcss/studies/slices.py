@@ -170,22 +170,13 @@ def curve_minima(values: Float[ArrayLike, " s"]) -> Minima:
     Raises:
         ShapeError: If there is not exactly one axis, or a sample is NaN.
     """
+    from scipy.signal import find_peaks  # takes a second to import
+
     curve = np.asarray(values, float)
     if curve.ndim != 1 or np.isnan(curve).any():
         raise ShapeError(f"values: expected one axis of numbers, got shape {list(curve.shape)}")
-    starts = np.flatnonzero(np.diff(curve, prepend=np.nan) != 0)  # of the runs of equal samples
-    ends = np.append(starts[1:], len(curve))
-    level = curve[starts]
-    found = [i for i in range(1, len(level) - 1) if level[i - 1] > level[i] < level[i + 1]]
-    prominence = [min(_climb(level[i::-1]), _climb(level[i:])) for i in found]
-    middle = [(starts[i] + ends[i] - 1) // 2 for i in found]
-    return Minima(np.array(middle, dtype=int), np.array(prominence, dtype=float))
-
-
-def _climb(levels: SampledCurve) -> float:
-    """How far one climbs from the first sample on before one is below it, or the end is reached."""
-    lower = np.flatnonzero(levels < levels[0])
-    return float(levels[: lower[0] if len(lower) else None].max() - levels[0])
+    sample, found = find_peaks(-curve, prominence=0.0)
+    return Minima(sample, found["prominences"])
 
 
 def num_spurious(minima: Minima) -> int:

@@ -23,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.errors import ConfigurationError
 from torchcss.types import Curvature, PointCost, Trajectory, frozen
 
 _METRES = ("root_x", "root_y", "root_z")
@@ -87,30 +88,15 @@ def clamped_spline(
 ) -> Float[Tensor, " t"]:
     """The cubic spline with continuous second derivatives that starts and ends at rest.
 
-    With slopes s at the knots and h the intervals, the second derivatives agree where
-    `s_(i-1)/h_(i-1) + 2 (1/h_(i-1) + 1/h_i) s_i + s_(i+1)/h_i = 3 (d_(i-1)/h_(i-1) + d_i/h_i)`,
-    d the slopes of the chords.
-
     Args:
         knots: Ascending places.
         values: Values there.
         at: Where to evaluate; beyond the ends the end values hold.
     """
-    x, y = (torch.as_tensor(v, dtype=at.dtype, device=at.device) for v in (knots, values))
-    step = x.diff()
-    chord = y.diff() / step
-    size = len(x)
-    matrix, right = torch.eye(size).to(x), torch.zeros_like(x)
-    for i in range(1, size - 1):
-        before, after = 1 / step[i - 1], 1 / step[i]
-        matrix[i, i - 1], matrix[i, i], matrix[i, i + 1] = before, 2 * (before + after), after
-        right[i] = 3 * (chord[i - 1] * before + chord[i] * after)
-    slope = torch.linalg.solve(matrix, right)
-    at = at.clamp(x[0], x[-1])
-    i = torch.searchsorted(x, at, right=True).sub(1).clamp(0, size - 2)
-    h, t = step[i], (at - x[i]) / step[i]
-    a = y[i] * (1 + 2 * t) * (1 - t) ** 2 + y[i + 1] * t * t * (3 - 2 * t)
-    return a + h * (slope[i] * t * (1 - t) ** 2 - slope[i + 1] * t * t * (1 - t))
+    from scipy.interpolate import CubicSpline  # takes a second to import
+
+    inside = at.clamp(knots[0], knots[-1]).numpy(force=True)
+    return torch.from_numpy(CubicSpline(knots, values, bc_type="clamped")(inside)).to(at)
 
 
 def plant_feet(body: BodyModel, states: Trajectory) -> Trajectory:
@@ -160,7 +146,16 @@ MOTIONS = {
 """The built-in motions."""
 
 
-def sample_times(duration: float, frame_rate: float, num_frames: int | None) -> Tensor:
-    """Times of the frames: `num_frames`, or as many as begin before the motion's end."""
-    count = round(duration * frame_rate) if num_frames is None else num_frames
-    return torch.arange(count, dtype=torch.float64) / frame_rate
+def sample_times(num_frames: int, frame_rate: float) -> Float[Tensor, " t"]:
+    """Times of frames, seconds.
+
+    Args:
+        num_frames: How many.
+        frame_rate: Frames per second.
+
+    Raises:
+        ConfigurationError: If there is to be no frame.
+    """
+    if num_frames < 1:
+        raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
+    return torch.arange(num_frames, dtype=torch.float64) / frame_rate

@@ -23,6 +23,7 @@ from torchcss.body.load import FileOptions, load_body
 from torchcss.body.model import BodyModel
 from torchcss.errors import BodyError
 from torchcss.studies.render.clutter import clutter_background
+from torchcss.studies.render.motions import sample_times
 from torchcss.studies.render.renderer import Lighting, Mesh, capsule, random_texture
 from torchcss.studies.render.scene import look_at
 from torchcss.studies.render.sequences import SyntheticSequence, film_parts
@@ -128,8 +129,11 @@ def robot_sequence(
         amplitude: See `swing`.
         num_frames: Number of frames.
         frame_rate: Frames per second.
+
+    Raises:
+        ConfigurationError: If there is to be no frame.
     """
-    times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
+    times = sample_times(num_frames, frame_rate)
     states = swing(body, times, generator=generator, middle=middle, amplitude=amplitude)
     (sequence,) = film_robot(body, states, generator=generator, frame_rate=frame_rate)
     return sequence

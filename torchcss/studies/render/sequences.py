@@ -156,14 +156,12 @@ def arm_sequence(*, generator: torch.Generator, num_frames: int = 50) -> Synthet
     Raises:
         ConfigurationError: If there is to be no frame.
     """
-    if num_frames < 1:
-        raise ConfigurationError(f"num_frames must be at least 1, got {num_frames}")
+    frame_rate = 25.0
+    times = sample_times(num_frames, frame_rate)
     # World: Y up, the camera at its origin looking along -Z. The body faces the camera.
     shoulder = torch.tensor([0.30, 0.16, -1.75], dtype=torch.float64)
     body = load_body("arm8").with_base(torch.eye(3, dtype=torch.float64), shoulder)
     camera = look_at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), focal_px=640.0, name="demo")
-    frame_rate = 25.0
-    times = torch.arange(num_frames, dtype=torch.float64) / frame_rate
     background = clutter_background(480, 640, generator=generator)
     textures = [random_texture(generator=generator) for _ in body.part_names]
     fine, faces = body.mesh(40, 48), grid_faces(40, 48)
@@ -350,12 +348,13 @@ def shot(name: str, *, seed: int = 0, num_frames: int | None = None, small: bool
         small: A quarter of the picture's width and height, for tests.
 
     Raises:
-        ConfigurationError: If there is no such sequence.
+        ConfigurationError: If there is no such sequence, or there is to be no frame.
     """
     if name not in MOTIONS:
         raise ConfigurationError(f"no sequence {name!r}; expected one of {', '.join(MOTIONS)}")
     poses, frame_rate = MOTIONS[name], 50.0
-    times = sample_times(poses.duration, frame_rate, num_frames)
+    every = round(poses.duration * frame_rate)  # as many as begin before the motion's end
+    times = sample_times(every if num_frames is None else num_frames, frame_rate)
     is_arm = poses.body.startswith("arm")
     lengths = None if is_arm else random_lengths(generator=torch.Generator().manual_seed(seed))
     body = load_body(poses.body, lengths=lengths)
