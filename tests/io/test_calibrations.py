@@ -14,7 +14,7 @@ import pytest
 from torchcss.body.rotations import about
 from torchcss.errors import CameraError
 from torchcss.io.calibrations import read_entries
-from torchcss.io.cameras import load_camera, read_cameras
+from torchcss.io.cameras import load_camera, load_lens, read_cameras
 from torchcss.io.video import VideoWriter
 
 SIZE = (640, 480)
@@ -426,6 +426,99 @@ def test_fisheye_by_any_usual_name(tmp_path: Path, model: dict[str, Any]) -> Non
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(CameraError, match="fisheye"):
         load_camera(tmp_path / "a.json")
+
+
+FISHEYE = (0.05, -0.01, 0.003, -0.0004)
+K1_TO_K4 = {f"k{n}": value for n, value in enumerate(FISHEYE, start=1)}
+FISHEYE_FILES: dict[str, tuple[str, Any]] = {
+    "ROS": (
+        "a.yaml",
+        SIZES + yaml_matrix("camera_matrix", K, 3, "").replace("   dt: d\n", "")
+        + yaml_matrix("distortion_coefficients", FISHEYE, 1, "").replace("   dt: d\n", "")
+        + "distortion_model: equidistant\n",
+    ),
+    "Kalibr": (
+        "camchain.yaml",
+        f"cam0:\n  camera_model: pinhole\n  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n"
+        f"  distortion_model: equi\n  distortion_coeffs: {[*FISHEYE]}\n"
+        "  resolution: [640, 480]\n",
+    ),
+    "COLMAP": (
+        "cameras.txt",
+        f"1 OPENCV_FISHEYE 640 480 {FX} {FY} {CX + 0.5} {CY + 0.5} "
+        f"{' '.join(map(str, FISHEYE))}\n",
+    ),
+    "Anipose, FreeMoCap": (
+        "calibration.toml",
+        f"[cam_0]\nname = 'a'\nsize = [640, 480]\nmatrix = {K}\ndistortions = {[*FISHEYE]}\n"
+        "rotation = [0.0, 0.0, 0.0]\ntranslation = [0.0, 0.0, 2.0]\nfisheye = true\n",
+    ),
+    "OpenCV's sample": (
+        "a.yml",
+        OPENCV + "fisheye_model: 1\n" + yaml_matrix("camera_matrix", K, 3)
+        + yaml_matrix("distortion_coefficients", FISHEYE, 4),
+    ),
+    "Nerfstudio": (
+        "transforms.json",
+        {"camera_model": "OPENCV_FISHEYE", "fl_x": FX, "fl_y": FY, "cx": CX + 0.5,
+         "cy": CY + 0.5, "w": 640, "h": 480, **K1_TO_K4},
+    ),
+    "ORB-SLAM": (
+        "a.yaml",
+        "%YAML:1.0\nCamera.type: 'KannalaBrandt8'\n" + "".join(
+            f"Camera1.{word}: {value}\n"
+            for word, value in {"fx": FX, "fy": FY, "cx": CX, "cy": CY, **K1_TO_K4}.items()
+        ) + "Camera.width: 640\nCamera.height: 480\n",
+    ),
+    "camodocal, VINS": (
+        "a.yaml",
+        "%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\ncamera_name: a\n" + SIZES
+        + "projection_parameters:\n" + "".join(f"   k{n + 2}: {k}\n" for n, k in enumerate(FISHEYE))
+        + f"   mu: {FX}\n   mv: {FY}\n   u0: {CX}\n   v0: {CY}\n",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", FISHEYE_FILES)
+def test_fisheye_lenses_by_the_formula_of_opencv(tmp_path: Path, kind: str) -> None:
+    """Refused as cameras, with the command that makes pictures straight, which reads them."""
+    name, content = FISHEYE_FILES[kind]
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(CameraError, match="fisheye lens is not supported: torchcss undistort"):
+        load_camera(path)
+    loaded, lens = load_lens(path)
+    assert lens.is_fisheye
+    np.testing.assert_allclose(lens.K, K)
+    np.testing.assert_allclose(lens.coefficients, FISHEYE)
+    assert not loaded.camera.has_distortion
+    assert loaded.camera.image_size_wh == SIZE
+
+
+@pytest.mark.parametrize("count", [5, 8, 12, 14])
+def test_lenses_of_many_coefficients(tmp_path: Path, count: int) -> None:
+    given = [*LENS, *0.01 * np.arange(1, 10)][:count]
+    path = tmp_path / "a.yml"
+    text = yaml_matrix("camera_matrix", K, 3) + yaml_matrix("distortion_coefficients", given, 1)
+    path.write_text(OPENCV + text)
+    assert load_lens(path)[1].coefficients == tuple(given)
+    if count > 5:
+        with pytest.raises(CameraError, match=f"of {count} coefficients.*torchcss undistort"):
+            load_camera(path)
+    path.write_text((OPENCV + text).replace(f"{given[-1]}]", ".nan]"))
+    with pytest.raises(CameraError, match="distortion"):
+        load_lens(path)
+
+
+@pytest.mark.parametrize(
+    "model", ["omni", "ds", "eucm", "FOV", "THIN_PRISM_FISHEYE", "MEI", "Scaramuzza"]
+)
+def test_lenses_of_other_models(tmp_path: Path, model: str) -> None:
+    content = {"K": K, "D": LENS[:4], "width": 640, "height": 480, "camera_model": model}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    for read in (load_camera, load_lens):
+        with pytest.raises(CameraError, match="this model of a fisheye lens is not supported"):
+            read(tmp_path / "a.json")
 
 
 def test_an_inverse_model_is_refused_unless_it_is_none(tmp_path: Path) -> None:

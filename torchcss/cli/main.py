@@ -6,6 +6,7 @@
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss detect VIDEO` | finds the keypoints of a video |
 | `torchcss track VIDEO` | tracks a body through a video |
+| `torchcss undistort VIDEO` | makes straight pictures of a fisheye lens's |
 | `torchcss batch MANIFEST` | tracks many clips, by several processes |
 | `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |
@@ -32,6 +33,7 @@ from torchcss.cli.init import Init
 from torchcss.cli.options import SettingsOptions, Terminal, TerminalOptions
 from torchcss.cli.smooth import Smooth
 from torchcss.cli.track import Track
+from torchcss.cli.undistort import Undistort
 from torchcss.cli.view import Plot, Report, View
 from torchcss.errors import OutputError, TorchcssError
 from torchcss.studies.demo import DEMO_SETTINGS, run_demo
@@ -62,7 +64,7 @@ class Demo:
         )
 
 
-Verb = Demo | Init | Detect | Track | Batch | Smooth | Export | View | Plot | Report
+Verb = Demo | Init | Detect | Undistort | Track | Batch | Smooth | Export | View | Plot | Report
 
 _DESCRIPTION = """Tracks a body with joints through a video, and keeps the poses that explain it.
 

@@ -70,7 +70,8 @@ class Entry(NamedTuple):
         translation: World to camera.
         units: Unit of the world and of pixels.
         video: Name of the video.
-        fisheye: Whether the lens is one that is not supported; "inverse": its model is inverse.
+        fisheye: What a lens is that follows no pinhole's model: "equidistant" (k1 k2 k3 k4 of
+            OpenCV's fisheye lens are its distortion), "inverse", or True of another kind.
         note: What was assumed, for the user.
         name: What the camera calls itself.
     """
@@ -109,7 +110,10 @@ _POSES = names_in("extrinsic extrinsics extrinsicmatrix extrinsicsmatrix rt w2c 
 _DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs|coefficients|dvec)$")
 """How the name of a lens's coefficients begins, or all of it."""
 
-_ONE_BY_ONE = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("fl_x", "fl_y", "cx", "cy"))
+_ONE_BY_ONE = (
+    ("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("mu", "mv", "u0", "v0"),
+    ("fl_x", "fl_y", "cx", "cy"),
+)  # fmt: skip
 """What the numbers of K are called where each has a name; the last are Nerfstudio's."""
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -124,8 +128,13 @@ _MODELS = names_in(
     "distortionmodel cameramodel modeltype model cameratype distortiontype lensmodel lens lenstype "
     "projection type"
 )
-_IS_FISHEYE = names_in("fisheye isfisheye usefisheye fisheyemodel mappingcoefficients xi")
-_FISHEYE = re.compile("equidist|fish_?eye|kannala|omni|eucm|fov|^ds$|^ds-|-ds$", re.IGNORECASE)
+_IS_FISHEYE = names_in("fisheye isfisheye usefisheye fisheyemodel")
+_IS_OTHER = names_in("mappingcoefficients xi")
+_FISHEYE = re.compile("equi|fish_?eye|kannala|^kb[48]?$", re.IGNORECASE)
+_OTHER = re.compile(
+    "omni|ucm|fov|theta|prism_fish|scaramuzza|ocam|mei$|double|^ds$|^ds-|-ds$", re.IGNORECASE
+)
+"""Models of lenses that are OpenCV's fisheye lens, and others that see as much."""
 
 _ROUNDING = 1e-3
 """Skew that is taken for rounding, in focal lengths."""
@@ -152,6 +161,8 @@ _COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2", "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4", "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
 }  # fmt: skip
 """The parameters of COLMAP's camera models, in the words of Nerfstudio, which counts from the same
 corner; f is both focal lengths."""
@@ -226,24 +237,40 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         # Of K with a column of zeros the place is not known.
         found |= parts if projection[:, 3].any() else {"K": parts["K"]}
     models = [str(first_of(values, (word,))) for word in _MODELS]
-    said = str(first_of(values, _IS_FISHEYE)).lower() not in ("none", "false", "0", "0.0")
-    lens, size, video = _lens(values), _said_size(values), values.get("video")
+    fisheye = _fisheye(values, models)
+    lens, size, video = _lens(values, fisheye), _said_size(values), values.get("video")
     if any(map(_INVERSE.search, models)) and np.any(np.array(lens, dtype=object)):
-        said = "inverse"
+        fisheye = "inverse"
     notes = []
     if turned := first_of(values, ("rotationcount",)):  # Caliscope's
         notes.append(
             f"its pictures are shown turned (rotation_count {shortened(turned)}), its numbers are "
             "those of the pictures as recorded: track them as recorded"
         )
-    if _shape(lens) == (4, 1):
+    if _shape(lens) == (4, 1) and not fisheye:
         notes.append(
             "its four coefficients stand in a column, as cv2.fisheye writes them, and are taken as "
-            "k1 k2 p1 p2: of a fisheye lens undistort the video first"
+            'k1 k2 p1 p2: of a fisheye lens say so in a cameras.json, "fisheye": true'
         )
-    return Entry(**found, image_size_wh=size, distortion=lens, units=units, video=video,
-                 fisheye=said or any(map(_FISHEYE.search, models)), name=values.get("name"),
-                 note="; ".join(notes) or None)  # fmt: skip
+    return Entry(
+        **found,
+        image_size_wh=size,
+        distortion=lens,
+        units=units,
+        video=video,
+        fisheye=fisheye,
+        name=values.get("name"),
+        note="; ".join(notes) or None,
+    )
+
+
+def _fisheye(values: Mapping[str, Any], models: Sequence[str]) -> bool | str:
+    """Which lens that follows no pinhole's model: see `Entry`."""
+    said = [str(first_of(values, words)).lower() for words in (_IS_FISHEYE, _IS_OTHER)]
+    is_fisheye, is_other = (word not in ("none", "false", "0", "0.0") for word in said)
+    if is_other or any(map(_OTHER.search, models)):
+        return True
+    return "equidistant" if is_fisheye or any(map(_FISHEYE.search, models)) else False
 
 
 def _is_inner(word: str, value: Any) -> bool:
@@ -265,7 +292,7 @@ def _one_by_one(values: Mapping[str, Any]) -> list[Any] | None:
     """fx, fy, cx, cy where each has a name, or focal lengths and principal point have."""
     for names in _ONE_BY_ONE:
         if None not in (numbers := [values.get(each) for each in names]):
-            return numbers if names[0] == "fx" else _from_corner(numbers)
+            return _from_corner(numbers) if names[0] == "fl_x" else numbers
     focal, centre = (_plain(first_of(values, _WORDS[word])) for word in ("focal", "centre"))
     if isinstance(focal, (int, float)):
         focal = [focal, focal]
@@ -273,7 +300,7 @@ def _one_by_one(values: Mapping[str, Any]) -> list[Any] | None:
     return [*focal, *centre] if given and len(focal) == len(centre) == 2 else None
 
 
-def _lens(values: Mapping[str, Any]) -> Any:
+def _lens(values: Mapping[str, Any], fisheye: bool | str = False) -> Any:
     """The coefficients of the lens in OpenCV's order, or whatever stands in their place."""
     lenses = [
         _plain(each)
@@ -289,6 +316,9 @@ def _lens(values: Mapping[str, Any]) -> Any:
     if lens is not None:
         return lens
     if any(each in values for each in _COEFFICIENTS):
+        if fisheye == "equidistant" and not any(values.get(each) for each in ("p1", "p2")):
+            first = 1 if "k1" in values or "mu" not in values else 2  # camodocal's first is k2
+            return [values.get(f"k{first + n}", 0.0) for n in range(4)]
         return [values.get(each, 0.0) for each in _COEFFICIENTS]
     radial, tangential = (first_of(values, _WORDS[word]) for word in ("radial", "tangential"))
     if len(shape := _shape(radial)) != 1 or not 0 < shape[0] <= 6 or radial is None:
@@ -565,17 +595,15 @@ def _colmap_entries(rows: Mapping[str, Sequence[str]]) -> dict[str, Entry]:
         except ValueError:
             size = values = []
         names = _COLMAP.get(model, "").split()
-        if "FISHEYE" in model:
-            entries[row[0]] = Entry([], size, fisheye=True)
-            continue
         if not names or len(values) != len(names) or len(size) != 2:
             raise CameraError(
                 f"{where}: expected COLMAP's camera, CAMERA_ID MODEL WIDTH HEIGHT and the "
-                f"parameters of {', '.join(_COLMAP)}; found {shortened(' '.join(row))}"
+                f"parameters of {', '.join(_COLMAP)} (of others colmap image_undistorter makes "
+                f"straight pictures); found {shortened(' '.join(row))}"
             )
         given = dict(zip(names, values, strict=True))
         focal = {word: given["f"] for word in ("fl_x", "fl_y") if "f" in given}
-        entries[row[0]] = _entry({**given, **focal, "image_size_wh": size})
+        entries[row[0]] = _entry({**given, **focal, "image_size_wh": size, "model": model})
     return entries
 
 

@@ -28,6 +28,7 @@ from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
 from torchcss.files import StrPath, real_numbers, shortened, unexpected
 from torchcss.io.calibrations import Entry, read_entries
+from torchcss.io.lenses import MOST_COEFFICIENTS, Lens
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
@@ -97,20 +98,96 @@ def load_camera(
     Raises:
         CameraError: If the file is missing or malformed, or which camera is meant is not clear.
     """
-    path = Path(path)
+    name, entry = _chosen(Path(path), name, video)
+    where = f"{path}: camera {name!r}"
+    numbers = _checked(entry, where)
+    if (why := _unlike_a_pinhole(numbers.distortion, entry.fisheye)) is not None:
+        raise CameraError(
+            f"{where}: {why} is not supported: torchcss undistort VIDEO --camera THIS --out FOLDER "
+            "makes straight pictures, and their camera and keypoints"
+        )
+    distortion = numbers.distortion[:5]
+    return _loaded(name, entry, numbers._replace(distortion=distortion), path)
+
+
+def load_lens(
+    path: StrPath,
+    name: str | None = None,
+    *,
+    video: StrPath | None = None,
+    fov: float | None = None,
+) -> tuple[LoadedCamera, Lens]:
+    """Read a camera's lens, of whatever model, and the camera of the pictures made straight.
+
+    Args:
+        path: As for `load_camera`.
+        name: The same.
+        video: The same.
+        fov: Degrees that the straight pictures show from left to right; None: as
+            `Lens.straightened_K` says.
+
+    Raises:
+        CameraError: As for `load_camera`, or the lens is of a model that is not known.
+    """
+    name, entry = _chosen(Path(path), name, video)
+    where = f"{path}: camera {name!r}"
+    numbers = _checked(entry, where)
+    is_fisheye = entry.fisheye == "equidistant"
+    most = MOST_COEFFICIENTS[is_fisheye]
+    coefficients = numbers.distortion
+    if len(coefficients) > most or not np.isfinite(coefficients).all():
+        raise unexpected(
+            CameraError, f"{where}: distortion", f"at most {most} numbers", coefficients.tolist()
+        )
+    numbers = numbers._replace(distortion=np.zeros(4))
+    _loaded(name, entry, numbers, path)  # which checks K
+    lens = Lens(numbers.K, tuple(coefficients.tolist()), is_fisheye)
+    size = (int(numbers.size[0]), int(numbers.size[1]))
+    straight = numbers._replace(K=lens.straightened_K(size, fov))
+    return _loaded(name, entry, straight, path), lens
+
+
+class _Numbers(NamedTuple):
+    """The numbers of an entry, checked."""
+
+    K: np.ndarray
+    size: np.ndarray
+    distortion: np.ndarray
+    rotation: np.ndarray | None
+    translation: np.ndarray | None
+
+
+def _chosen(path: Path, name: str | None, video: StrPath | None) -> tuple[str, Entry]:
+    """The camera that is meant, with the size of the video if it has none of its own."""
     entries = read_entries(path)
     name = _choose(path, entries, name, None if video is None else Path(video))
-    entry, where = entries[name], f"{path}: camera {name!r}"
-    if entry.fisheye:
-        what = "an inverse model of a" if entry.fisheye == "inverse" else "a fisheye"
+    entry = entries[name]
+    if entry.fisheye not in (False, "equidistant"):
+        what = "an inverse model of a" if entry.fisheye == "inverse" else "this model of a fisheye"
         raise CameraError(
-            f"{where}: {what} lens is not supported; undistort the video first and give the camera "
-            "of the undistorted images"
+            f"{path}: camera {name!r}: {what} lens is not supported; undistort the video by the "
+            "program that calibrated it, and give the camera of the undistorted images"
         )
     if entry.image_size_wh is None and video is not None and Path(video).exists():
         info = VideoReader(video).info
         entry = entry._replace(image_size_wh=[info.width, info.height])
-    camera = _make_camera(entry, name, path)
+    return name, entry
+
+
+def _loaded(name: str, entry: Entry, numbers: _Numbers, path: StrPath) -> LoadedCamera:
+    """The camera in the frame that its file allows, and what is said of it."""
+    K, size, distortion, rotation, translation = numbers
+    try:
+        camera = Camera(
+            K,
+            (int(size[0]), int(size[1])),
+            distortion=distortion,
+            R_camera_world=rotation,
+            t_camera_world=translation,
+            name=name,
+        )
+    except CameraError as error:
+        raise CameraError(f"{path}: camera {error}") from error
     note, unit = _own_frame_note(name, entry), _metres(entry.units)
     if note is not None:
         camera = camera.in_own_frame()
@@ -120,9 +197,12 @@ def load_camera(
     return LoadedCamera(camera, note is None, said or None)
 
 
-def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
-    """The camera of an entry, in the file's world, after its numbers are checked."""
-    where = f"{path}: camera {name!r}"
+def _checked(entry: Entry, where: str) -> _Numbers:
+    """The numbers of an entry, K and rotation as matrices, the distortion in a row of four or more.
+
+    Raises:
+        CameraError: If something is missing or no number.
+    """
     if entry.K is None:
         raise CameraError(f"{where}: K (matrix) is missing")
     if entry.image_size_wh is None:
@@ -147,36 +227,22 @@ def _make_camera(entry: Entry, name: str, path: Path) -> Camera:
         rotation = rotation.ravel()
         is_matrix = rotation.size == 9
         rotation = rotation.reshape(3, 3) if is_matrix else rotation_matrix(rotation, where)
-    lens = None if distortion is None else _five(distortion.ravel(), where)
-    try:
-        return Camera(
-            K,
-            (int(size[0]), int(size[1])),
-            distortion=lens,
-            R_camera_world=rotation,
-            t_camera_world=None if translation is None else translation.ravel(),
-            name=name,
-        )
-    except CameraError as error:
-        raise CameraError(f"{path}: camera {error}") from error
+    distortion = np.zeros(4) if distortion is None else distortion.ravel()
+    if len(distortion) == 3 and not entry.fisheye:
+        raise CameraError(f"{where}: distortion: expected k1 k2 p1 p2 [k3], found 3 numbers")
+    # Simpler models have k1 and k2 alone.
+    distortion = np.pad(distortion, (0, max(0, 4 - len(distortion))))
+    translation = None if translation is None else translation.ravel()
+    return _Numbers(K, size, distortion, rotation, translation)
 
 
-def _five(distortion: np.ndarray, where: str) -> np.ndarray:
-    """Coefficients in the number that a camera takes; OpenCV's others must be zero.
-
-    Raises:
-        CameraError: If they are not.
-    """
-    if len(distortion) < 4:  # k1, k2 of simpler models
-        if len(distortion) == 3:
-            raise CameraError(f"{where}: distortion: expected k1 k2 p1 p2 [k3], found 3 numbers")
-        return np.concatenate([distortion, np.zeros(4 - len(distortion))])
+def _unlike_a_pinhole(distortion: np.ndarray, fisheye: object) -> str | None:
+    """What a lens is that a camera does not follow; None: it does."""
+    if fisheye:
+        return "a fisheye lens"
     if distortion[5:].any():
-        raise CameraError(
-            f"{where}: distortion of {len(distortion)} coefficients (OpenCV's rational model) is "
-            "not supported; calibrate with five, or undistort the video first"
-        )
-    return distortion[:5]
+        return f"distortion of {len(distortion)} coefficients (OpenCV's rational model)"
+    return None
 
 
 def camera_entry(camera: Camera) -> dict[str, Any]:
