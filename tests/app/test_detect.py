@@ -173,6 +173,8 @@ def test_frames_that_nobody_asks_for_are_not_detected(files: Path, crowd: Crowd)
     assert mask is not None
     assert mask[24].mean() > 200 > mask[40].mean()
     assert is_detected(files / "nowhere.npz", 9)
+    (files / "broken.npz").write_bytes(b"PK\x03\x04 half of a file")
+    assert is_detected(files / "broken.npz", 9)
     for stop in (None, 9):  # beyond the end
         path = detect_video(files / "video.mp4", files / "all.npz", detector=crowd, stop=stop)
         assert is_detected(path, None)

@@ -300,3 +300,9 @@ def test_files_that_were_moved_are_known_again(
     assert (files.video, files.keypoints) == (after / "film", after / "keypoints2d.npz")
     if not of_pictures:
         np.testing.assert_array_equal(run.track.state, whole.track.state)
+
+
+def test_options_that_make_no_sense_are_refused() -> None:
+    for options in ({"sigma": 0.0}, {"sigma": float("nan")}, {"checkpoint_every": -1.0}):
+        with pytest.raises(ConfigurationError, match=next(iter(options))):
+            TrackOptions(**options)

@@ -201,6 +201,8 @@ def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
     for bad in (2 * turn, -turn, turn * torch.nan):
         with pytest.raises(ConfigurationError, match="rotation: expected a rotation"):
             body.with_base(bad, shift)
+    with pytest.raises(ShapeError, match="rotation: expected float32 or float64"):
+        body.with_base(torch.eye(3, dtype=torch.int64), shift)
     with pytest.raises(ShapeError, match="translation: expected a tensor, got list"):
         body.with_base(turn, [0.0, 0.0, 0.0])  # type: ignore[arg-type]
 

@@ -354,6 +354,8 @@ def test_odd_marks_are_named_and_gross_ones_move_little():
         ({"left_tentacle": (10, 10)}, "unknown joint"),
         ({"l_wrist": (float("nan"), 10)}, "0 joints"),
         ({"l_wrist": (10,)}, "expected"),
+        ({"l_wrist": (10, 10, 1.0, 3.0)}, r"expected \(u, v\) or"),
+        ({"l_wrist": "there"}, r"expected \(u, v\) or"),
     ],
 )
 def test_marks_from_which_nothing_follows(given: dict, message: str, generator: torch.Generator):

@@ -94,6 +94,13 @@ def test_a_floor_that_is_nowhere_is_refused() -> None:
         InitialiseOptions(ground=math.nan)
 
 
+@pytest.mark.parametrize("sigma", [0.0, -1.0, math.nan])
+def test_a_noise_that_is_none_is_refused(sigma: float) -> None:
+    """Zero is not the same as not given."""
+    with pytest.raises(ConfigurationError, match=r"Options\.sigma: expected a positive"):
+        InitialiseOptions(sigma=sigma)
+
+
 def test_a_small_adult_is_found_small_and_near() -> None:
     true = standing(0.93)
     names = true.body.joint_names

@@ -186,6 +186,9 @@ def test_bad_questions_are_told(tmp_path: Path, generator: torch.Generator) -> N
         inverse_kinematics(human, "l_wrist_link", pose, generator=generator)
     with pytest.raises(ConfigurationError, match=r"Search\.spacing"):
         Search(spacing=0)
+    for share in (-0.1, 1.1):
+        with pytest.raises(ConfigurationError, match=r"Search\.share: expected 0 to 1"):
+            Search(share=share)
     with pytest.raises(ConfigurationError, match="no free parameter of the body moves 'link0'"):
         inverse_kinematics(body, "link0", pose, generator=generator)
     for bad, message in ((pose * torch.nan, "finite"), (2 * pose, "a rotation")):

@@ -255,13 +255,13 @@ def _clip(row: object, where: str, folder: Path) -> Clip:
     for name, value in row.items():
         if value in (None, ""):
             continue
-        what = "a number" if name in _NUMBERS else "a text"
-        if not isinstance(value, (str, int, float)):
+        kind = _NUMBERS.get(name, str)
+        with suppress(ValueError):
+            if isinstance(value, str | int | float):
+                given[name] = kind(str(value))
+        if name not in given:
+            what = {int: "a whole number", float: "a number", str: "a text"}[kind]
             raise unexpected(ConfigurationError, f"{where}: {name}", what, value)
-        try:
-            given[name] = _NUMBERS.get(name, str)(str(value))
-        except ValueError as error:
-            raise unexpected(ConfigurationError, f"{where}: {name}", what, value) from error
         if name in FILE_COLUMNS:
             given[name] = os.path.abspath(folder / given[name])
     name = given.pop("name", Path(given["video"]).stem)

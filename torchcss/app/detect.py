@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchcss.errors import KeypointError
-from torchcss.files import prepare_output_folder, save_arrays
+from torchcss.files import load_arrays, prepare_output_folder, save_arrays
 from torchcss.io.detect import Detected, Detector, DetectorName, open_detector
 from torchcss.io.keypoints.one_person import identified
 from torchcss.io.video import VideoReader, VideoWriter
@@ -106,9 +106,8 @@ def is_detected(keypoints: Path, stop: int | None) -> bool:
         stop: The frame; None: the video's end.
     """
     try:
-        with np.load(keypoints, allow_pickle=False) as arrays:
-            _, end = arrays["frames_seen"].tolist()
-    except (OSError, ValueError, KeyError):
+        _, end = load_arrays(keypoints, KeypointError)["frames_seen"].tolist()
+    except (KeyError, ValueError, TypeError):  # a KeypointError is a ValueError
         return True
     return end == _TO_THE_END or (stop is not None and stop <= end)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchcss.app.view_files import FrameSelection, moments, open_run
 from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
-from torchcss.files import StrPath, prepare_output_folder
+from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.inference.smoothing import Refined
 from torchcss.initialise.view import CameraView
 from torchcss.io.run import Run, as_run, body_of_track
@@ -244,11 +244,9 @@ def run_settings(run: Run) -> Settings:
     Raises:
         ConfigurationError: If its settings are not those of this version.
     """
-    try:
-        told = {"body": run.body.name, **run.settings, "device": "cpu", "dtype": "float64"}
+    told = {"body": run.body.name, **run.settings, "device": "cpu", "dtype": "float64"}
+    with naming(run.path, ConfigurationError):
         return settings_from_plain(told)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{run.path}: {error}") from error
 
 
 def report(effect: Mapping[str, Any]) -> str:

@@ -27,7 +27,7 @@ from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import FrameSelection, OpenView, moments, open_run, open_view
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
-from torchcss.errors import CameraError, ConfigurationError, TrackFileError
+from torchcss.errors import CameraError, ConfigurationError, TrackFileError, check_positive
 from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
@@ -101,8 +101,7 @@ class TrackOptions:
     detect: DetectOptions = DetectOptions()
 
     def __post_init__(self) -> None:
-        if self.sigma is not None and not self.sigma > 0:
-            raise ConfigurationError(f"sigma must be positive, got {self.sigma}")
+        check_positive(self, "sigma", finite=True)
         if not self.checkpoint_every >= 0:
             raise ConfigurationError(
                 f"checkpoint_every must be at least 0 seconds, got {self.checkpoint_every}"

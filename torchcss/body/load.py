@@ -46,7 +46,7 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.rotations import as_vector
 from torchcss.errors import BodyError, ConfigurationError, MotionCaptureError, check_device
-from torchcss.files import one_line
+from torchcss.files import naming
 from torchcss.joint_names import skeleton_joint_names
 from torchcss.types import frozen
 
@@ -113,33 +113,31 @@ def load_body(
     if dtype not in (torch.float32, torch.float64):
         raise ConfigurationError(f"dtype: expected torch.float32 or torch.float64, got {dtype!r}")
     check_device(device)
+    if str(name_or_path) in BODY_NAMES:
+        body = specification(
+            str(name_or_path),
+            lengths=lengths,
+            scale=scale,
+            free_proportions=free_proportions,
+            free_root=free_root,
+        )
+        return BodyModel(body).to(dtype=dtype, device=device)
     path = Path(name_or_path)
+    if path.suffix.lower() not in BODY_SUFFIXES:
+        raise BodyError(
+            f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the "
+            f"path of a file that ends in {', '.join(BODY_SUFFIXES)}"
+        )
+    if lengths:
+        raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
+    if not 0 < scale < np.inf:
+        raise BodyError(f"scale must be positive and finite, got {scale}")
     try:
-        if str(name_or_path) in BODY_NAMES:
-            body = specification(
-                str(name_or_path),
-                lengths=lengths,
-                scale=scale,
-                free_proportions=free_proportions,
-                free_root=free_root,
-            )
+        with naming(path, BodyError):
+            body = scaled(_from_file(path, file or FileOptions(), free_root), scale)
             return BodyModel(body).to(dtype=dtype, device=device)
-        if path.suffix.lower() not in BODY_SUFFIXES:
-            raise BodyError(
-                f"no body {str(name_or_path)!r}; expected one of {', '.join(BODY_NAMES)} or the "
-                f"path of a file that ends in {', '.join(BODY_SUFFIXES)}"
-            )
-        if lengths:
-            raise BodyError(f"{path}: a body from a file has its own lengths; use scale")
-        if not 0 < scale < np.inf:
-            raise BodyError(f"scale must be positive and finite, got {scale}")
-        body = scaled(_from_file(path, file or FileOptions(), free_root), scale)
     except RecursionError as error:
         raise BodyError(f"{path}: links hundreds deep; expected a body or a robot") from error
-    try:
-        return BodyModel(body).to(dtype=dtype, device=device)
-    except (BodyError, RecursionError) as error:  # a tree that cannot be
-        raise BodyError(f"{path}: {one_line(error)}") from error
 
 
 def has_free_root(name_or_path: str | Path) -> bool:
@@ -212,20 +210,15 @@ def _read(
     if path.suffix.lower() == ".bvh":
         try:
             skeleton = read_bvh_skeleton(path, units=units)
-        except MotionCaptureError as error:
+        except (MotionCaptureError, ConfigurationError) as error:
             raise BodyError(str(error)) from error
-        except ConfigurationError as error:
-            raise BodyError(f"{path}: {error}") from error
         return skeleton, (), _BVH_Y_UP if skeleton.is_z_up else _AS_IT_IS
     if units is not None:
         raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")
     root = parse_xml(path, "a URDF")
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
         return *read_mjcf(path), _Y_UP
-    try:
-        return *read_urdf(root, path.parent), _Y_UP
-    except BodyError as error:
-        raise BodyError(f"{path}: {error}") from error
+    return *read_urdf(root, path.parent), _Y_UP
 
 
 def _middle_of_hips(

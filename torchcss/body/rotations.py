@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, check_shape
+from torchcss.errors import ConfigurationError, check_floating, check_shape
 
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -82,10 +82,11 @@ def check_rotation(name: str, matrix: Float[Tensor, "3 3"]) -> None:
         matrix: The matrix.
 
     Raises:
-        ShapeError: If it is not 3 x 3.
+        ShapeError: If it is not 3 x 3, or of whole numbers.
         ConfigurationError: If it is no rotation.
     """
     check_shape(name, matrix, 3, 3)
+    check_floating(name, matrix)
     error = float((matrix @ matrix.mT - torch.eye(3).to(matrix)).abs().max())
     if not error < ROUNDING or float(torch.linalg.det(matrix)) < 0:
         raise ConfigurationError(

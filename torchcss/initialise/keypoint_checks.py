@@ -15,6 +15,7 @@ import torch
 from torchcss.body.root import has_root
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import KeypointError, check_shape
+from torchcss.files import refusing
 from torchcss.initialise.multi_start import StartSearch, multi_start_fits
 from torchcss.initialise.outliers import capped_cost
 from torchcss.joint_names import JOINT_NAMES, canonical_joint_name
@@ -53,10 +54,9 @@ def keypoints_by_name(
         unknown = list(places)[names.index("")]
         known = ", ".join(dict.fromkeys(own.values()) or JOINT_NAMES)
         raise KeypointError(f"unknown joint {unknown!r}; the known ones are {known}")
-    rows = [[*(float(number) for number in place), 1.0][:3] for place in places.values()]
-    if any(len(row) != 3 for row in rows):
-        raise KeypointError("expected (u, v) or (u, v, confidence) for every joint")
-    table = torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
+    with refusing(KeypointError, "expected (u, v) or (u, v, confidence) for every joint"):
+        rows = [(u, v, *(told or [1.0])) for u, v, *told in places.values()]
+        table = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), 3)
     return Keypoints(table[:, :2], table[:, 2], names)
 
 

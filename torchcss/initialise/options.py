@@ -19,7 +19,7 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.pose_prior import PosePrior
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine, TrackingCost
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_positive
 from torchcss.initialise.multi_start import PAPERS, StartSearch
 from torchcss.initialise.view import CameraView
 from torchcss.robust import Lorentzian
@@ -83,6 +83,7 @@ class InitialiseOptions:
     engine: Literal["fused", "eager"] = "fused"
 
     def __post_init__(self) -> None:
+        check_positive(self, "sigma", finite=True)
         if self.ground is not None and not math.isfinite(self.ground):
             raise ConfigurationError(f"ground: expected metres, got {self.ground}")
         if self.num_modes is not None and self.num_modes < 1:

@@ -122,6 +122,8 @@ class Search:
         check_positive(
             self, "num_samples", "patience", "max_rounds", "sigma", "spacing", "tolerance"
         )
+        if not 0 <= self.share <= 1:
+            raise ConfigurationError(f"Search.share: expected 0 to 1, got {self.share}")
 
 
 def inverse_kinematics(

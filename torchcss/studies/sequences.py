@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float
 
 from torchcss.body.load import load_body
 from torchcss.errors import CameraError, KeypointError, TrackFileError, VideoError
-from torchcss.files import StrPath, load_arrays, one_line
+from torchcss.files import StrPath, load_arrays, refusing
 from torchcss.io.cameras import check_image_size, load_camera
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
@@ -225,13 +225,11 @@ def read_motion(
     if "base_transform" in arrays:
         base = _array(path, arrays, "base_transform", (4, 4))
     turn, place = torch.from_numpy(base[:3, :3]), torch.from_numpy(base[:3, 3])
-    try:
+    with refusing(TrackFileError, f"{path}: no motion of a body of ours"):
         lengths = json.loads(str(arrays.get("lengths", "{}")))
         lengths = {str(k): float(v) for k, v in lengths.items()}
         body = load_body(str(arrays["body"]), lengths=lengths).with_base(turn, place)
         rate = float(arrays["frame_rate"] if frame_rate is None else frame_rate)
-    except (ValueError, AttributeError, TypeError) as error:  # ValueError: JSON's and ours
-        raise TrackFileError(f"{path}: no motion of a body of ours: {one_line(error)}") from error
     names = tuple(str(name) for name in arrays["state_names"].reshape(-1))
     if names != body.state_names:
         raise TrackFileError(
