@@ -95,6 +95,21 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
         "HumanoidRoot vt1 l_shoulder l_elbow l_wrist r_shoulder r_elbow r_wrist "
         "l_hip l_knee l_ankle r_hip r_knee r_ankle -"
     ),
+    # OpenPose's model of MPII: the last is the middle of the trunk.
+    "MPI-15": (
+        *_columns("skull_tip vt1 r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist"),
+        *_OPENPOSE_LEGS,
+        None,
+    ),
+    "LSP-14": _columns(
+        "r_ankle r_knee r_hip l_hip l_knee l_ankle "
+        "r_wrist r_elbow r_shoulder l_shoulder l_elbow l_wrist vt1 skull_tip"
+    ),
+    "CrowdPose-14": (*_COCO[5:], *_columns("skull_tip vt1")),
+    "AIC-14": _columns(
+        "r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist "
+        "r_hip r_knee r_ankle l_hip l_knee l_ankle skull_tip vt1"
+    ),
     # The first 18 of BODY_25, the middle of the hips among them.
     "BODY_18": _BODY_19[:18],
     "Halpe-26": _HALPE,
@@ -109,6 +124,17 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     "H36M-17": (*_H36M, None, *_H36M_END),
     # Without the place between nose and neck.
     "H36M-16": (*_H36M, *_H36M_END),
+    # MPI-INF-3DHP's test sequences.
+    "3DHP-17": (
+        *_columns("skull_tip vt1 r_shoulder r_elbow r_wrist l_shoulder l_elbow l_wrist"),
+        *_OPENPOSE_LEGS,
+        *_columns("HumanoidRoot - -"),
+    ),
+    # Kinect's second version, NTU RGB+D: 3 is the middle of the head.
+    "Kinect-25": _columns(
+        "HumanoidRoot - - - l_shoulder l_elbow l_wrist - r_shoulder r_elbow r_wrist - "
+        "l_hip l_knee l_ankle - r_hip r_knee r_ankle - vt1 - - - -"
+    ),
     # 'foot' is the ball of the foot, 'hand' the knuckles, 'head' the joint under the skull.
     "SMPL-24": _columns(
         "HumanoidRoot l_hip r_hip vl5 l_knee r_knee - l_ankle r_ankle - l_midtarsal r_midtarsal "

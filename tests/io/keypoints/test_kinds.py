@@ -1576,3 +1576,152 @@ def test_an_object_in_every_line(tmp_path: Path, suffix: str) -> None:
         read(path)
     with pytest.raises(KeypointError, match=f"b.{suffix}: .*[Nn]o such file|missing"):
         read(tmp_path / f"b.{suffix}")
+
+
+FOURTEEN = ("LSP-14", "CrowdPose-14", "AIC-14")
+TOPS: dict[str | None, tuple[int, int]] = {"skull_tip": (320, 70), "HumanoidRoot": (320, 270)}
+
+
+def of_layout(name: str) -> np.ndarray:
+    """Every frame's joints in an order that a file does not name."""
+    rows = [person(t, ALIASES[name]) for t in T]
+    for t, of in enumerate(rows):
+        for joint, place in enumerate(ALIASES[name]):
+            if place in TOPS:
+                of[joint, :2] = TOPS[place][0] + 3 * t, TOPS[place][1] + t
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("name", [*FOURTEEN, "MPI-15", "HumanEva-15", "3DHP-17", "Kinect-25"])
+def test_layouts_are_told_by_their_middles(tmp_path: Path, name: str) -> None:
+    np.save(tmp_path / "a.npy", of_layout(name))
+    found = read(tmp_path / "a.npy")
+    check(found, names=LIMBS[:-1])
+    assert any(line.startswith(f"layout: {name}, by its") for line in found.report)
+
+
+def test_a_layout_that_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
+    rows = of_layout("LSP-14")
+    rows[:, 12] = 0  # nobody's neck is seen
+    np.save(tmp_path / "a.npy", rows)
+    with pytest.raises(KeypointError, match=r"14 joints.*LSP-14, CrowdPose-14, AIC-14: say so"):
+        read(tmp_path / "a.npy")
+    check(read(tmp_path / "a.npy", layout="LSP-14"), names=LIMBS[:-1])
+
+
+@pytest.mark.parametrize("form", ["csv", "npy", "json"])
+def test_landmarks_in_space_are_no_places_in_the_picture(tmp_path: Path, form: str) -> None:
+    """MediaPipe's pose_world_landmarks: metres about the middle of the hips, in the same form."""
+    rows = np.stack([person(t, ALIASES["MediaPipe-33"]) for t in T])
+    rows[..., :2] = (rows[..., :2] - rows[:, 23:25, :2].mean(1, keepdims=True)) / 200
+    fours = np.insert(rows.round(4), 2, 0.1, axis=-1)
+    path = tmp_path / f"a.{form}"
+    if form == "npy":
+        np.save(path, fours)
+    elif form == "json":
+        write(path, [[dict(zip("xyz", row, strict=False)) for row in t] for t in fours.tolist()])
+    else:
+        heads = [f"{axis}{n}" for n in range(1, 34) for axis in "xyzv"]
+        rows_of_text = [heads, *fours.reshape(FRAMES, -1).tolist()]
+        write(path, "\n".join(",".join(map(str, row)) for row in rows_of_text))
+    with pytest.raises(KeypointError, match="points in space about the middle of the hips"):
+        read(path)
+
+
+APPLES = {
+    "nose": "head_joint", "l_eye": "left_eye_joint", "vt1": "neck_1_joint",
+    **{f"{side[0]}_{place}": f"{side}_{word}_joint"
+       for side in ("left", "right")
+       for place, word in {"shoulder": "shoulder_1", "elbow": "forearm", "wrist": "hand",
+                           "hip": "upLeg", "knee": "leg", "ankle": "foot"}.items()},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", ["Vision", "ARKit", "pixels"])
+def test_apples_joints(tmp_path: Path, form: str) -> None:
+    """The same names: Vision's y counts upwards, ARKit's downwards."""
+    frames = []
+    for t in T:
+        joints = {}
+        for name, word in APPLES.items():
+            u, v = PLACES[name][0] + 3 * t, PLACES[name][1] + t
+            x, y = (u + 0.5) / 640, (v + 0.5) / 480
+            x, y = {"Vision": (x, 1 - y), "ARKit": (x, y), "pixels": (u, v)}[form]
+            joints[word] = {"x": x, "y": y, "confidence": 0.8}
+        frames.append({"frame": t, "joints": joints})
+    found = read(write(tmp_path / "a.json", frames))
+    check(found)
+    assert {"l_eye", "vt1"} <= {*found.names}
+    assert any("counts upwards, as in" in line for line in found.report) == (form == "Vision")
+
+
+def test_what_ultralytics_returns_as_it_is(tmp_path: Path) -> None:
+    def frame(t: int) -> dict[str, Any]:
+        people = np.stack([other(t), person(t)])
+        keypoints = {"xy": people[..., :2].tolist(), "conf": people[..., 2].tolist()}
+        keypoints["xyn"] = (people[..., :2] / SIZE).tolist()
+        return {"frame": t, "keypoints": keypoints}
+
+    found = read(write(tmp_path / "a.json", [frame(t) for t in T]))
+    check(found)
+    assert float(found.confidence[0, 0]) == pytest.approx(0.6)
+
+
+def test_pixels_beside_points_in_space(tmp_path: Path) -> None:
+    """Kinect's: where a joint is, and where the colour camera sees it."""
+    words = {"SpineBase": "HumanoidRoot", **{
+        place.title() + side: f"{side[0].lower()}_{place}"
+        for side in ("Left", "Right")
+        for place in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    }}  # fmt: skip
+    frames = [
+        {"bodies": [{"trackingId": 7, "joints": {
+            word: {"x": 0.1, "y": 0.2, "z": 2.0, "colorX": PLACES[name][0] + 3 * t,
+                   "colorY": PLACES[name][1] + t}
+            for word, name in words.items()}}]}
+        for t in T
+    ]  # fmt: skip
+    check(read(write(tmp_path / "a.json", frames)), names=LIMBS[:-1])
+
+
+@pytest.mark.parametrize("form", ["FreeMoCap", "PYSKL"])
+def test_arrays_whose_first_axis_is_one_person_or_camera(tmp_path: Path, form: str) -> None:
+    path = tmp_path / "a.npz"
+    if form == "PYSKL":
+        rows = np.stack([person(t) for t in T])[None]
+        np.savez(path, keypoint=rows[..., :2], keypoint_score=rows[..., 2])
+    else:
+        rows = np.full((1, FRAMES, 553, 3), np.nan)
+        rows[0, :, :33] = [person(t, ALIASES["MediaPipe-33"]) for t in T]
+        np.save(path := tmp_path / "a.npy", rows[0])
+    found = read(path)
+    check(found)
+    assert any("one in each" in line for line in found.report) == (form == "PYSKL")
+    if form == "FreeMoCap":
+        np.save(path, np.concatenate([rows, rows]))
+        with pytest.raises(KeypointError, match=r"such as array\[0\]"):
+            read(path)
+
+
+@pytest.mark.parametrize("form", ["a name a column", "body part and kind"])
+def test_tables_that_pandas_keeps_in_hdf5(tmp_path: Path, form: str) -> None:
+    """With other columns than DeepLabCut's: a block for every kind of number."""
+    h5py = pytest.importorskip("h5py")
+    parts = [(name, kind) for name in TFJS for kind in ("x", "y", "likelihood")]
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.create_group("df")
+        group["axis1"] = np.arange(FRAMES)
+        values = np.array([flat(t) for t in T])
+        if form == "a name a column":
+            heads = [b"frame", *(f"{name}_{kind}".encode() for name, kind in parts)]
+            group["axis0"] = np.array(heads)
+            group["block0_items"], group["block0_values"] = np.array(heads[1:]), values
+            group["block1_items"] = np.array(heads[:1])
+            group["block1_values"] = np.arange(FRAMES)[:, None]
+        else:
+            for number, own in enumerate(zip(*parts, strict=True)):
+                level = sorted({*own})
+                group[f"axis0_level{number}"] = np.array([each.encode() for each in level])
+                group[f"axis0_label{number}"] = np.array([level.index(each) for each in own])
+            group["block0_values"] = values
+    check(read(tmp_path / "a.h5"))

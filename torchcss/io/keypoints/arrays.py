@@ -20,7 +20,13 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays, shortened, unexpected
 from torchcss.io.keypoints.frames import FRAMES_AT_MOST
-from torchcss.io.keypoints.mediapipe import FOURS, LAYOUT, is_landmark_array, landmark_places
+from torchcss.io.keypoints.mediapipe import (
+    FOURS,
+    LAYOUT,
+    NUM_LANDMARKS,
+    is_landmark_array,
+    landmark_places,
+)
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
     Frames,
@@ -34,7 +40,12 @@ from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIDES, SIZE
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
-_PLACES = names_in("keypoints keypoints2d joints2d kps kpts poses positions pose joints xy")
+_PLACES = names_in(
+    "keypoints keypoints2d joints2d kps kpts poses positions pose joints xy keypoint keypoint2d"
+)
+_FREEMOCAP = (553, 3)
+"""x, y and z of FreeMoCap's points, which are MediaPipe's of body, hands and face."""
+
 MOST_BYTES = 2**31
 """Bytes of the largest set of arrays of keypoints: as of 33 people with 133 in 20,000 frames."""
 
@@ -54,6 +65,8 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     alone = len(arrays) == 1
     name = next(iter(arrays)) if alone else first_of({key: key for key in numbers}, _PLACES)
     array, counts = _numbered(arrays.get(name or "", np.zeros(0)))
+    if array.shape[-2:] == _FREEMOCAP:
+        array = array[..., :NUM_LANDMARKS, :]
     if name is None:
         raise unexpected(
             KeypointError, "", "the arrays keypoints, confidence and joint_names", list(arrays)

@@ -111,21 +111,39 @@ def _read_pandas(path: Path, group: Any) -> People:
         columns = PlainUnpickler(axes, encoding="latin1").load()[0][1]
         index = table["index"].tolist()
     else:
-        values, columns = _array(path, group["block0_values"]), _levels(path, group, "axis0")
+        values, columns = _blocks(path, group), _levels(path, group, "axis0")
         # Of labelled pictures the last level is the name.
         pictures = [row[-1] for row in _levels(path, group, "axis1")]
         index = pictures or _array(path, group["axis1"]).tolist()
     # As the rows of its CSV.
-    levels = [*zip(*(map(str, column) for column in columns), strict=True)][1:]
-    titles = ("individuals", "bodyparts", "coords")[-len(levels) :]
+    columns = [column if isinstance(column, tuple) else (column,) for column in columns]
+    levels = [*zip(*(map(str, column) for column in columns), strict=True)]
+    levels = levels[1:] if len(levels) > 2 else levels  # without the scorer
+    titles = ("individuals", "bodyparts", "coords")[-len(levels) :] if len(levels) > 1 else ("",)
     heads = [[title, *level] for title, level in zip(titles, levels, strict=True)]
     keys = [key.decode() if isinstance(key, bytes) else f"{key}" for key in index]
     rows = [[key, *map(repr, row)] for key, row in zip(keys, values.tolist(), strict=True)]
     return people_of_rows([*enumerate([*heads, *rows], start=1)])
 
 
+def _blocks(path: Path, group: Any) -> np.ndarray:
+    """The numbers of all columns, which stand in a block for every kind of number."""
+    columns = _levels(path, group, "axis0")
+    blocks = sorted(key for key in group if key.endswith("_values"))
+    if len(blocks) == 1:
+        return _array(path, group[blocks[0]])
+    values = np.full((len(group["axis1"]), len(columns)), np.nan)
+    for key in blocks:
+        items = _levels(path, group, key.replace("values", "items"))
+        values[:, [columns.index(item) for item in items]] = _array(path, group[key])
+    return values
+
+
 def _levels(path: Path, group: Any, axis: str) -> list[tuple[str, ...]]:
-    """The names along an axis that has several levels; none where it has one."""
+    """The names along an axis that has one level or several; none where it only counts."""
+    if axis in group:
+        dataset = group[axis]
+        return [(text,) for text in _texts(path, dataset)] if dataset.dtype.kind in "SO" else []
     levels = sorted(key for key in group if key.startswith(f"{axis}_level"))
     labels = (_array(path, group[key.replace("level", "label")]) for key in levels)
     texts = (np.array(_texts(path, group[key])) for key in levels)

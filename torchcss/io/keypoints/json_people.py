@@ -43,9 +43,13 @@ PEOPLE = names_in(
 )
 JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
-    "pose kps kpts keypointsxy keypoints2d joints2d"
+    "pose kps kpts keypointsxy keypoints2d keypoint2d joints2d"
 )
-_XY = {"x", "y"}
+_AXES = tuple(
+    names_in(f"pixel{axis} color{axis} image{axis} {axis}2d {axis}px {axis}") for axis in "xy"
+)
+"""What the coordinates of a joint are called; pixels come before points in space (Kinect)."""
+
 _BOX = frozenset(names_in("x left x1 xmin"))
 """What has a word of these has the size of a box."""
 
@@ -71,6 +75,8 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             return people_of(f"{where}: {key}", value[key])
         if (key := key_of(value, JOINTS)) is not None:
             inner = value[key]
+            if isinstance(inner, dict) and isinstance(inner.get("xy"), list):  # Ultralytics' own
+                return people_of(where, {"keypoints": inner["xy"], "scores": inner.get("conf")})
             if isinstance(inner, dict) and key_of(inner, JOINTS) is not None:
                 return people_of(where, inner)
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
@@ -137,10 +143,15 @@ def is_joints(value: list[Any]) -> bool:
         key = key_of(first, JOINTS)  # of a person, who may have a box with x and y
         if key is not None and isinstance(first[key], (list, dict)):
             return False
-        return {*map(plain_word, first)} >= _XY or "position" in first
+        return _has_place(first) or "position" in first
     return (
         isinstance(first, list) and 2 <= len(first) <= 4 and not isinstance(first[0], (list, dict))
     )
+
+
+def _has_place(entry: Mapping[str, Any]) -> bool:
+    """Whether an object has x and y."""
+    return all(key_of(entry, words) is not None for words in _AXES)
 
 
 def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) -> list[Person]:
@@ -235,10 +246,10 @@ def _row(where: str, row: Any) -> list[float]:
         return [np.nan] * 3
     if isinstance(row, dict):
         place = row.get("position", row)
-        if not isinstance(place, dict) or not {*map(plain_word, place)} >= _XY:
+        if not isinstance(place, dict) or not _has_place(place):
             raise unexpected(KeypointError, where, "x, y and visibility", row)
         given = first_of(row, CONFIDENCES)
-        x, y = (first_of(place, (axis,)) for axis in "xy")
+        x, y = (first_of(place, words) for words in _AXES)
         row = [x, y, float(given) if isinstance(given, bool) else given]
     elif isinstance(row, list) and len(row) == 4:
         row = [row[0], row[1], row[3]]  # x, y, z, visibility

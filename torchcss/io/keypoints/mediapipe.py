@@ -31,6 +31,9 @@ _FACE, _HAND = 468, 21
 _HOLISTIC = 4 * NUM_LANDMARKS + 3 * (_FACE + 2 * _HAND)
 """Numbers of the landmarks of body, face and hands in a row, the body's first."""
 
+_HIPS, _AT_ORIGIN = [23, 24], 2e-3
+"""The hips, and how far their middle may be from the origin: people round numbers."""
+
 MEDIAPIPE_NAMES = names_in(
     "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer "
     "left_ear right_ear mouth_left mouth_right left_shoulder right_shoulder left_elbow right_elbow "
@@ -90,6 +93,23 @@ def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
             joints[place] = person.joints
             found[key].append(person._replace(joints=joints))
     return found
+
+
+def check_not_in_space(frames: Sequence[np.ndarray]) -> None:
+    """Refuse `pose_world_landmarks`, whose origin is the middle of the hips.
+
+    Args:
+        frames: The people of every frame, `[p 33 3]`.
+
+    Raises:
+        KeypointError: If most people's hips are about the origin.
+    """
+    middles = np.concatenate([frame[:, _HIPS, :2].mean(1) for frame in frames])
+    if len(middles) and np.median(np.abs(middles).max(-1)) < _AT_ORIGIN:
+        raise KeypointError(
+            "these landmarks are points in space about the middle of the hips, MediaPipe's "
+            "pose_world_landmarks; expected its pose_landmarks, which are places in the picture"
+        )
 
 
 def landmark_places(array: np.ndarray) -> np.ndarray:

@@ -48,6 +48,7 @@ import torch
 from torchcss.body.model import BodyModel
 from torchcss.errors import KeypointError
 from torchcss.files import StrPath, load_array, load_arrays, naming, read_text, shortened
+from torchcss.io.keypoints.apple import in_plain_words
 from torchcss.io.keypoints.arrays import MOST_BYTES, read_arrays
 from torchcss.io.keypoints.cvat import read_cvat
 from torchcss.io.keypoints.findings import findings
@@ -57,6 +58,8 @@ from torchcss.io.keypoints.hdf5 import read_hdf5
 from torchcss.io.keypoints.json_files import read_content, read_folder, read_json
 from torchcss.io.keypoints.labels import read_labels
 from torchcss.io.keypoints.links import Links, joints_named, names_links
+from torchcss.io.keypoints.mediapipe import LAYOUT as LANDMARKS
+from torchcss.io.keypoints.mediapipe import check_not_in_space
 from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.sides import with_sides_put_back
@@ -187,7 +190,7 @@ def read_person(
             raise KeypointError(
                 f"unknown layout {layout!r}; the known ones are {', '.join((*ALIASES, OWN_NAMES))}"
             )
-        people = _read(path, whom.image_size_wh, film.num_frames)
+        people = in_plain_words(_read(path, whom.image_size_wh, film.num_frames))
         names = partial(_joint_names, people, layout=layout or people.layout, links=links)
         return _person(people, film, whom, normalised, names)
 
@@ -202,6 +205,11 @@ def _person(
     """Who is followed, checked and in pixels."""
     first_frame, _, image_size_wh = whom
     report = list(people.report)
+    if isinstance(people.frames, list) and len(people.frames) == 1:
+        alone = people.frames[0]
+        if 1 < len(alone) == film.num_frames:
+            people = people._replace(frames=[[person] for person in alone])
+            report.append("as many people in one frame as the video has frames: one in each")
     everyone = in_order(people, film, report)
     everyone = [[p for p in frame if is_there(p.joints)] for frame in everyone]
     frames = _stacked(everyone)
@@ -209,6 +217,8 @@ def _person(
     frames = _checked_numbers(frames, people.names, report)
     _check_somebody(frames, first_frame)
     points = np.concatenate([frame[frame[..., 2] > 0.0][:, :2] for frame in frames])
+    if people.layout == LANDMARKS:
+        check_not_in_space(frames)
     if people.corner_fractions:
         scale, shift, note = _from_corner(points, image_size_wh)
     elif people.size_wh is not None and _are_pixels(points, normalised):
@@ -315,7 +325,7 @@ def _check_counts(
         if {len(frame) for frame in frames} == {film.num_frames}:
             raise KeypointError(
                 f"{len(frames)} cameras or people with {film.num_frames} frames each, it seems; "
-                "expected frames first, of this camera alone"
+                "expected frames first, of this camera alone, such as array[0]"
             )
         raise wrong_count(film.num_frames, len(frames))
     if not 0 <= first_frame < max(1, len(frames)):
@@ -550,29 +560,47 @@ def _names_of_people(
 
 _MIDDLES = {
     "BODY_25": ((8, 9, 12),), "BODY_18": ((8, 9, 12),),
-    "H36M-17": ((0, 1, 4), (7, 0, 8), (8, 11, 14)),
+    "Kinect-25": ((0, 12, 16), (20, 4, 8)),
+    "H36M-17": ((0, 1, 4), (7, 0, 8), (8, 11, 14)), "3DHP-17": ((14, 8, 11), (1, 2, 5)),
     "H36M-16": ((0, 1, 4), (7, 0, 8), (8, 10, 13)),
+    "HumanEva-15": ((0, 8, 11),), "MPI-15": ((1, 2, 5),),
+    "LSP-14": ((12, 8, 9),), "CrowdPose-14": ((13, 0, 1),), "AIC-14": ((13, 0, 3),),
 }  # fmt: skip
-"""Joints of layouts that stand in the middle of two others: hips, and spine and shoulders."""
+"""Joints of layouts that stand in the middle of two others: hips, shoulders, and spine of both."""
 
 
 def _recognise(chosen: np.ndarray) -> tuple[str, str]:
-    """Return the layout of unnamed joints and why."""
-    candidates = _LAYOUTS_BY_COUNT[chosen.shape[1]]
+    """Return the layout of unnamed joints and why.
+
+    Raises:
+        KeypointError: If it cannot be told.
+    """
+    num_joints = chosen.shape[1]
+    candidates = _LAYOUTS_BY_COUNT[num_joints]
     if len(candidates) == 1:
-        return candidates[0], f"by its {chosen.shape[1]} joints"
-    for layout, middles in _MIDDLES.items():
-        columns = np.array(middles)
-        seen = chosen[(chosen[:, columns.ravel() % chosen.shape[1], 2] > 0.0).all(axis=1)]
-        if layout not in candidates or not len(seen):
+        return candidates[0], f"by its {num_joints} joints"
+    refuted = ""
+    for layout in (each for each in candidates if each in _MIDDLES):
+        columns = np.array(_MIDDLES[layout])
+        seen = chosen[(chosen[:, columns.ravel(), 2] > 0.0).all(axis=1)]
+        if not len(seen):
             continue
         places, size = seen[:, columns, :2], np.array([[size_of(person)] for person in seen])
         gaps = np.linalg.norm(places[:, :, 0] - places[:, :, 1:].mean(2), axis=-1) / size
-        is_it, (at, one, other) = (np.median(gaps, axis=0) < 0.08).all(), middles[0]
-        if not is_it and layout[:4] == "H36M":  # nor need it be the other one
-            continue
-        layout = layout if is_it else next(each for each in candidates if each != layout)
+        is_it, (at, one, other) = (np.median(gaps, axis=0) < 0.08).all(), _MIDDLES[layout][0]
         why = f"of which {at} is {'' if is_it else 'not '}the middle of {one} and {other}"
-        return layout, f"by its {chosen.shape[1]} joints, {why}"
-    others = ", ".join(candidates[1:])
-    return candidates[0], f"by its {chosen.shape[1]} joints ({others} has as many: set layout)"
+        if is_it:
+            return layout, f"by its {num_joints} joints, {why}"
+        refuted = refuted or why
+    plain = [each for each in candidates if each not in _MIDDLES]
+    if not plain:
+        raise KeypointError(
+            f"{num_joints} joints without names, of which it is not clear whether they are those "
+            f"of {', '.join(candidates)}: say so (--layout)"
+        )
+    if refuted and plain[0] != candidates[0]:
+        return plain[0], f"by its {num_joints} joints, {refuted}"
+    others = [each for each in candidates if each != plain[0]]
+    have = "has" if len(others) == 1 else "have"
+    told = f"({', '.join(others)} {have} as many: set layout)"
+    return plain[0], f"by its {num_joints} joints {told}"
