@@ -12,10 +12,11 @@ from torchcss.kernels import compiler
 
 CHECK = """
 import numpy as np
+import torch
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
 from torchcss.vision import appearance_kernels, blur_kernels, flow_kernels
-from torchcss.vision import rasterise_kernels, shrink_kernels
+from torchcss.vision import rasterise_kernels, resample_kernels
 
 assert compiler.CHECKED
 rng, single = np.random.default_rng(0), np.float32
@@ -27,10 +28,11 @@ for size in ((1, 1), (3, 4), (9, 1)):
     run(flow_kernels.linearise, moves, first, second, 1e-10, *found)
 
 for height, width, y, x in ((7, 5, 3, 2), (9, 9, 8, 8), (50, 3, 7, 1), (33, 64, 32, 63)):
-    pixels = rng.integers(0, 255, (height, 3 * width)).astype(np.uint8)
-    weights = *shrink_kernels.triangles(height, y), *shrink_kernels.triangles(width, x)
-    row, small = np.zeros(3 * width, single), np.zeros((3, y, x), single)
-    run(shrink_kernels.shrink, pixels, *weights, row, small)
+    pixels = torch.from_numpy(rng.integers(0, 255, (height, width, 3)).astype(np.uint8))
+    resized = torch.zeros(3, y, x)
+    resample_kernels.resize(pixels, resized, resample_kernels.triangles)
+    levels = resized.permute(1, 2, 0).contiguous()
+    resample_kernels.resize(levels, torch.zeros(3, height, width), resample_kernels.cubics)
 
 for size in ((1, 1), (3, 4), (9, 1)):
     image, blurred = rng.random((2, *size))

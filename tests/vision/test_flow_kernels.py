@@ -35,6 +35,27 @@ def test_median(size, radius, monkeypatch, generator):
 
 
 @pytest.mark.parametrize("size", SIZES)
+def test_gradient(size, monkeypatch, generator):
+    images = torch.rand(2, 1, *size, generator=generator)
+    got, expected = both(monkeypatch, lambda: flow._gradient(images))
+    torch.testing.assert_close(got, expected, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize(
+    ("size", "new"),
+    [
+        *[((1, 1), (8, 9)), ((1, 9), (1, 12)), ((2, 3), (5, 4)), ((33, 26), (41, 33))],
+        *[((9, 8), (7, 6)), ((5, 4), (5, 3)), ((33, 26), (26, 21))],
+    ],
+)
+def test_resized(size, new, monkeypatch, generator):
+    images = torch.rand(2, 2, *size, generator=generator)
+    got, expected = both(monkeypatch, lambda: flow._resized(images, new))
+    assert got.shape == (2, 2, *new)
+    torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", SIZES)
 def test_carried_marks(size, monkeypatch, generator):
     marks = torch.rand(2, *size, generator=generator)
     marks[marks < 0.3] = 0.0

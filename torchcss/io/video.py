@@ -749,10 +749,12 @@ def _is_cut_off(container: InputContainer) -> bool:
 def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture as a player shows it on a screen of standard range."""
     levels = table(int(stream.codec_context.color_trc or 0))
+    # One thread, as for decoding: on busy cores a picture waits longer for threads than it takes.
     if levels is None:
-        image = picture.to_ndarray(format="rgb24")
+        image = picture.to_ndarray(format="rgb24", threads=1)
     else:
-        image = np.take(levels, np.asarray(picture.to_ndarray(format="rgb48le"), np.uint16))
+        deep = picture.to_ndarray(format="rgb48le", threads=1)
+        image = np.take(levels, np.asarray(deep, np.uint16))
     quarter_turns = round(picture.rotation / 90)
     return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
 

@@ -31,7 +31,6 @@ from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.kernels import compiler
-from torchcss.kernels.checked import run
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
 from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
@@ -351,12 +350,10 @@ def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int] | None) -> Float
     if size is None or not compiled or planes.device.type != "cpu":
         planes = planes.to(torch.float32, memory_format=torch.contiguous_format)
         return _resized(planes, size)
-    from torchcss.vision.shrink_kernels import shrink, triangles
+    from torchcss.vision.resample_kernels import resize, triangles
 
     small = torch.empty(len(planes), *size, dtype=torch.float32)
-    pixels = planes.permute(1, 2, 0).contiguous().flatten(1)
-    rows, columns = map(triangles, planes.shape[-2:], size)
-    run(shrink, pixels, *rows, *columns, small.new_empty(pixels.shape[1]), small)
+    resize(planes.permute(1, 2, 0).contiguous(), small, triangles)
     return small
 
 

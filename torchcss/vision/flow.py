@@ -208,7 +208,7 @@ def robust_flow(
         rows, columns = grey.shape[-2:]
         textured = grey - configuration.texture * _structure(grey)
         scale = flow.new_tensor([columns / flow.shape[-1], rows / flow.shape[-2]])
-        flow = _enlarged(flow, (rows, columns)) * scale.view(1, 2, 1, 1)
+        flow = _resized(flow, (rows, columns)) * scale.view(1, 2, 1, 1)
         flow = _refine(flow, textured, grey[:, :1], configuration)
     data = _of_scale(configuration.data, _DATA_OUTLIER_SCALE)
     smoothness = _of_scale(configuration.smoothness, _SMOOTHNESS_OUTLIER_SCALE)
@@ -256,17 +256,25 @@ def _pyramid(frames: Images, configuration: FlowConfiguration) -> list[Images]:
     while min(height, width) * factor ** len(levels) >= _SMALLEST_SIDE:
         scale = factor ** len(levels)
         size = round(height * scale), round(width * scale)
-        levels.append(
-            functional.interpolate(levels[-1], size=size, mode="bilinear", antialias=True)
-        )
+        levels.append(_resized(levels[-1], size))
     return levels[::-1]
 
 
-def _enlarged(flow: Field, size: tuple[int, int]) -> Field:
-    """A flow for a larger size, not yet in its pixels."""
-    if flow.shape[-2:] == size:
-        return flow
-    return functional.interpolate(flow, size=size, mode="bicubic", align_corners=False)
+def _resized(images: Images, size: tuple[int, int]) -> Images:
+    """Images made smaller without aliases, or larger by cubic convolution."""
+    if images.shape[-2:] == size:
+        return images
+    smaller = sum(size) < sum(images.shape[-2:])
+    if has_flow_kernels(images):
+        from torchcss.vision.resample_kernels import cubics, resize, triangles
+
+        resized = images.new_empty(*images.shape[:-2], *size)
+        for image, to in zip(images.flatten(0, 1), resized.flatten(0, 1), strict=True):
+            resize(image.contiguous()[..., None], to[None], triangles if smaller else cubics)
+        return resized
+    if smaller:
+        return functional.interpolate(images, size=size, mode="bilinear", antialias=True)
+    return functional.interpolate(images, size=size, mode="bicubic", align_corners=False)
 
 
 def has_flow_kernels(images: Tensor) -> bool:
@@ -333,6 +341,14 @@ def _of_scale(potential: FlowPotential, sigma: float) -> FlowPotential:
 
 def _gradient(image: Plane) -> Field:
     """Derivatives along u and v, exact for polynomials of degree four."""
+    if has_flow_kernels(image):
+        from torchcss.vision import flow_kernels
+
+        found = image.new_empty(len(image), 2, *image.shape[-2:])
+        row = image.new_empty(image.shape[-1] + 4)
+        for (one,), along in zip(image, found, strict=True):
+            run(flow_kernels.gradient, one, row, *along)
+        return found
     u = functional.pad(image, (2, 2, 0, 0), mode="replicate")
     v = functional.pad(image, (0, 0, 2, 2), mode="replicate")
     along_u = 8 * (u[..., 3:-1] - u[..., 1:-3]) + u[..., :-4] - u[..., 4:]
@@ -452,7 +468,10 @@ def _weighed(
             flow.new_empty(batch, 1, height, width + 1),
             flow.new_empty(batch, 1, height + 1, width),
         )
-        choice = [(p.nu, p.sigma**2, least) for p, least in ((data, 0.0), (smoothness, weakest))]
+        choice = [
+            tuple(map(np.float32, (potential.nu, potential.sigma**2, least)))
+            for potential, least in ((data, 0.0), (smoothness, weakest))
+        ]
         for x, *parts in zip(flow, *constancy, *found, strict=True):
             arrays = tuple(part.squeeze(0).numpy() for part in parts)
             run(flow_kernels.weigh, x, arrays[:3], *choice, arrays[3:])
@@ -477,11 +496,13 @@ def _solve(flow: Field, energy: _Quadratic, num_iterations: int) -> Field:
     if has_flow_kernels(flow):
         from torchcss.vision import flow_kernels
 
-        ends = functional.pad(flow, (1, 1, 1, 1)), functional.pad(flow, (1, 1, 1, 1))
+        height, width = flow.shape[-2:]
+        memory, improved = flow.new_empty(2, 2, height + 2, width + 2), torch.empty_like(flow)
         system = target, inverse, energy.right.squeeze(1), energy.down.squeeze(1)
-        for one, other, *parts in zip(*ends, *system, strict=True):
-            run(flow_kernels.solve_flow, one, other, tuple(p.numpy() for p in parts), shares)
-        return ends[num_iterations % 2][..., 1:-1, 1:-1].contiguous()
+        for x, *parts, to in zip(flow, *system, improved, strict=True):
+            arrays = tuple(part.numpy() for part in parts)
+            run(flow_kernels.solve_flow, x, arrays, shares, *memory, to)
+        return improved
     (uu, vv, uv), before = inverse.split(1, dim=1), flow
     right, down = energy.right[..., 1:-1], energy.down[..., 1:-1, :]
     for length, keep in shares.tolist():
@@ -542,10 +563,10 @@ def _median(images: Images, radius: int) -> Images:
     if has_flow_kernels(images) and radius == 2:
         from torchcss.vision import flow_kernels
 
-        padded = functional.pad(images, (radius,) * 4, mode="replicate").flatten(0, 1)
+        padded = images.new_empty(height + 2 * radius, width + 2 * radius)
         out = torch.empty_like(images)
-        for plane, filtered in zip(padded, out.flatten(0, 1), strict=True):
-            run(flow_kernels.median, plane, filtered)
+        for plane, filtered in zip(images.flatten(0, 1), out.flatten(0, 1), strict=True):
+            run(flow_kernels.median, plane, padded, filtered)
         return out
     rows = max(1, _STRIP_VALUES // (images.shape[0] * images.shape[1] * width))
     padded = functional.pad(images, (radius,) * 4, mode="replicate")

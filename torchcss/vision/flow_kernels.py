@@ -25,6 +25,37 @@ def _far(t):  # type: ignore[no-untyped-def]
 
 
 @entry
+def gradient(image, row, along_u, along_v):  # type: ignore[no-untyped-def]
+    """Derivatives of an image, its border replicated; see `torchcss.vision.flow._gradient`.
+
+    Args:
+        image: `[h w]`, single precision.
+        row: Memory for a row and two pixels on either side, `[w+4]`.
+        along_u: Becomes the derivative along u, `[h w]`.
+        along_v: Becomes the derivative along v, `[h w]`.
+    """
+    height, width = image.shape
+    middle = row[2 : width + 2]
+    for y in range(height):
+        source = image[y]
+        for c in range(width):
+            middle[c] = source[c]
+        row[0] = row[1] = source[0]
+        row[width + 2] = row[width + 3] = source[width - 1]
+        _differences(row[:width], row[1:], row[3:], row[4:], along_u[y])
+        above, farther = image[max(y - 1, 0)], image[max(y - 2, 0)]
+        below, farthest = image[min(y + 1, height - 1)], image[min(y + 2, height - 1)]
+        _differences(farther, above, below, farthest, along_v[y])
+
+
+@inlined
+def _differences(first, second, fourth, fifth, into):  # type: ignore[no-untyped-def]
+    """Derivatives at the third of five points, exact for polynomials of degree four."""
+    for c in range(len(into)):
+        into[c] = (8.0 * (fourth[c] - second[c]) + first[c] - fifth[c]) * (1.0 / 12.0)
+
+
+@entry
 def linearise(flow, first, second, least, gradient, offset, visible):  # type: ignore[no-untyped-def]
     """Warp the second frame and linearise constant brightness, see `torchcss.vision.flow`.
 
@@ -166,21 +197,30 @@ def _relax(x, before, system, shares, step, row):  # type: ignore[no-untyped-def
 
 
 @entry
-def solve_flow(one, other, system, shares):  # type: ignore[no-untyped-def]
-    """Improve a flow, in place, by Chebyshev's semi-iteration; see `torchcss.vision.flow`.
+def solve_flow(flow, system, shares, one, other, improved):  # type: ignore[no-untyped-def]
+    """Improve a flow by Chebyshev's semi-iteration; see `torchcss.vision.flow`.
 
     Every step follows the one before at a distance of one row: what they share stays in the cache.
 
     Args:
-        one: The flow inside a border of zeros, `[2 h+2 w+2]`, single precision; after an even
-            number of steps the result.
-        other: A copy; after an odd number of steps the result.
+        flow: `[2 h w]`, single precision.
         system: Right-hand side, `[2 h w]`; inverse of each pixel's block (uu, vv, uv), `[3 h w]`;
             weights of the links between columns, `[h w+1]`, and between rows, `[h+1 w]`, zero at
             the ends.
         shares: Of Jacobi's step and of the change before, for each step, `[n 2]`.
+        one: Memory for the flow inside a border of zeros, `[2 h+2 w+2]`.
+        other: The same again.
+        improved: Becomes the flow after all steps.
     """
-    height, num = system[0].shape[1], len(shares)
+    (height, width), num = flow.shape[1:], len(shares)
+    for i in range(2):
+        for row in range(height + 2):
+            for c in range(width + 2):
+                one[i, row, c] = other[i, row, c] = 0.0
+        for row in range(height):
+            source, to, too = flow[i, row], one[i, row + 1, 1:], other[i, row + 1, 1:]
+            for c in range(width):
+                to[c] = too[c] = source[c]
     for front in range(height + num - 1):
         for step in range(max(0, front - height + 1), min(front + 1, num)):
             # Each array keeps its place in a call: only so is it seen that they differ.
@@ -188,6 +228,12 @@ def solve_flow(one, other, system, shares):  # type: ignore[no-untyped-def]
                 _relax(one, other, system, shares, step, front - step)
             else:
                 _relax(other, one, system, shares, step, front - step)
+    last = one if num % 2 == 0 else other
+    for i in range(2):
+        for row in range(height):
+            to, source = improved[i, row], last[i, row + 1, 1:]
+            for c in range(width):
+                to[c] = source[c]
 
 
 @inlined
@@ -206,7 +252,7 @@ def _sorted(a, b, c, d, e):  # type: ignore[no-untyped-def]
 
 
 @entry
-def median(padded, out):  # type: ignore[no-untyped-def]
+def median(image, padded, out):  # type: ignore[no-untyped-def]
     """Median over windows of five by five, as `torchcss.vision.flow._inner_median` finds it.
 
     Rows are sorted, then columns, which leaves rows sorted. So many are then above or below each
@@ -214,10 +260,18 @@ def median(padded, out):  # type: ignore[no-untyped-def]
     before it and of the least of the one behind it. All stays in registers, eight pixels at a time.
 
     Args:
-        padded: `[h+4 w+4]`, single precision.
-        out: `[h w]`.
+        image: `[h w]`, single precision.
+        padded: Memory for the image and two pixels about it, its border replicated, `[h+4 w+4]`.
+        out: Becomes the medians, `[h w]`.
     """
     height, width = out.shape
+    for row in range(height + 4):
+        source, whole = image[min(max(row - 2, 0), height - 1)], padded[row]
+        middle = whole[2:]
+        for c in range(width):
+            middle[c] = source[c]
+        whole[0] = whole[1] = source[0]
+        whole[width + 2] = whole[width + 3] = source[width - 1]
     for row in range(height):
         p, q, r = padded[row], padded[row + 1], padded[row + 2]
         s, t = padded[row + 3], padded[row + 4]
