@@ -17,11 +17,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.errors import ShapeError
+from torchcss.kernels import compiler
+from torchcss.kernels.checked import run
 from torchcss.linalg import (
     covariance_factor,
     log_determinant,
@@ -259,16 +262,23 @@ def distinct_modes(
         Indices of the modes kept, by ascending cost.
     """
     order, kept = cheapest_first(cost), []
-    while len(order) and len(kept) != most:
-        block, left = order[:_MODES_AT_ONCE], torch.ones_like(order, dtype=torch.bool)
+    room = len(cost) if most is None else most
+    while len(order) and room:
+        block = order[:_MODES_AT_ONCE]
         apart = mean[order] - mean[block, None]
         far = squared_lengths(apart, with_least_width(covariance[block])) > distance**2
+        far = far.cpu().numpy()  # one transfer for all of the block
+        left, own = np.ones(len(order), dtype=bool), []
         for place, others in enumerate(far):
-            if len(kept) != most and bool(left[place]):
-                kept.append(block[place])
+            if left[place] and len(own) < room:
+                own.append(place)
                 left &= others
-        order = order[len(block) :][left[len(block) :]]
-    return torch.stack(kept) if kept else order[:0]
+        room -= len(own)
+        later = len(block) + np.flatnonzero(left[len(block) :])
+        chosen, later = (torch.tensor(places, device=order.device) for places in (own, later))
+        kept.append(block[chosen])
+        order = order[later]
+    return torch.cat(kept) if kept else order[:0]
 
 
 def tempered(covariance: Matrices, power: float, prior_variance: Vector) -> Matrices:
@@ -308,22 +318,31 @@ def separated(
     Returns:
         Indices of the modes, in the order given.
     """
-    left = torch.ones(len(landmarks), dtype=torch.bool, device=landmarks.device)
-    chosen: list[int] = []
-    while len(chosen) < min(num, len(landmarks)):
+    taken = _taken(landmarks, distance, num)
+    if not fill:
+        return taken.nonzero()[:, 0]
+    chosen = taken.nonzero()[:, 0]
+    alike = (~taken).nonzero()[: num - len(chosen), 0]
+    return torch.cat([chosen, alike]).sort().values
+
+
+def _taken(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> Bool[Tensor, " k"]:
+    """Which modes are taken in their order, each unlike those taken before."""
+    taken = torch.zeros(len(landmarks), dtype=torch.bool, device=landmarks.device)
+    left = torch.ones_like(taken)
+    if compiler.COMPILED and landmarks.device.type == "cpu" and not torch.compiler.is_compiling():
+        from torchcss.inference.separation_kernels import separate  # compiled: where it is used
+
+        run(separate, landmarks.detach(), distance, num, taken, left)
+        return taken
+    for _ in range(min(num, len(landmarks))):
         # One number in a transfer: the best that is left, or none.
         best = int(torch.where(left.any(), left.int().argmax(), -1))
         if best < 0:
             break
-        chosen.append(best)
-        left[best] = False
+        taken[best], left[best] = True, False
         left &= (landmarks - landmarks[best]).norm(dim=-1).amax(-1) >= distance
-    taken = torch.zeros_like(left)
-    taken[chosen] = True
-    if not fill:
-        return taken.nonzero()[:, 0]
-    alike = (~taken).nonzero()[: num - len(chosen), 0]
-    return torch.cat([taken.nonzero()[:, 0], alike]).sort().values
+    return taken
 
 
 def representatives(

@@ -778,7 +778,7 @@ def _is_compiled(x: Tensor) -> bool:
 
 def _array(tensor: Tensor) -> np.ndarray:
     """The same memory, where it is contiguous: other layouts round differently."""
-    return tensor.detach().contiguous().numpy()
+    return tensor.contiguous().numpy()
 
 
 def _share_of_second_order(value: Numbers, predicted: Numbers) -> Tensor:

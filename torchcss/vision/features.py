@@ -310,7 +310,8 @@ class FeatureExtractor(nn.Module):
         """
         if not isinstance(picture, Tensor):
             # A copy only where torch cannot share the memory: read-only or mirrored arrays.
-            picture = np.require(picture, requirements=["C", "W"])
+            if not picture.flags.writeable or min(picture.strides, default=0) < 0:
+                picture = picture.copy()
             try:
                 picture = torch.from_numpy(picture)
             except (TypeError, ValueError) as error:
@@ -353,7 +354,7 @@ def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int] | None) -> Float
     from torchcss.vision.resample_kernels import resize, triangles
 
     small = torch.empty(len(planes), *size, dtype=torch.float32)
-    resize(planes.permute(1, 2, 0).contiguous(), small, triangles)
+    resize(planes.permute(1, 2, 0), small, triangles)
     return small
 
 

@@ -270,7 +270,7 @@ def _resized(images: Images, size: tuple[int, int]) -> Images:
 
         resized = images.new_empty(*images.shape[:-2], *size)
         for image, to in zip(images.flatten(0, 1), resized.flatten(0, 1), strict=True):
-            resize(image.contiguous()[..., None], to[None], triangles if smaller else cubics)
+            resize(image[..., None], to[None], triangles if smaller else cubics)
         return resized
     if smaller:
         return functional.interpolate(images, size=size, mode="bilinear", antialias=True)

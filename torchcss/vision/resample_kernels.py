@@ -70,7 +70,7 @@ def resize(picture: Tensor, resized: Tensor, weights: Weights) -> None:
     """Make a picture smaller, or larger.
 
     Args:
-        picture: Numbers of any type, `[h w c]`, contiguous.
+        picture: Numbers of any type, `[h w c]`.
         resized: Becomes the picture, `[c y x]`, single precision.
         weights: `triangles` to make it smaller, `cubics` to make it larger.
     """
