@@ -80,11 +80,11 @@ def resize(picture: Tensor, resized: Tensor, weights: Weights) -> None:
     )
     row = np.empty(width * channels, np.float32)
     columns = left * np.uint32(channels), across
-    run(resample, picture.flatten(1), *rows, *columns, row, resized)
+    run(sum_up, picture.flatten(1), *rows, *columns, row, resized)
 
 
 @entry
-def resample(picture, top, down, left, across, row, resized):  # type: ignore[no-untyped-def]
+def sum_up(picture, top, down, left, across, row, resized):  # type: ignore[no-untyped-def]
     """Sums of rows, and of numbers in these.
 
     Args:
