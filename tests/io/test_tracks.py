@@ -23,12 +23,12 @@ from hypothesis import strategies as st
 
 from torchcss import files as atomic
 from torchcss.errors import OutputError, ShapeError, TrackFileError
+from torchcss.files import prepare_output_folder
 from torchcss.io.tracks import (
     FrameModes,
     Track,
     TrackWriter,
     load_track,
-    prepare_output_folder,
     read_summary,
     write_summary,
 )
@@ -327,6 +327,15 @@ def test_other_schema_version(tmp_path: Path) -> None:
     arrays = arrays_of(tmp_path / "track.npz")
     np.savez(tmp_path / "b.npz", **(arrays | {"schema_version": np.array(7)}))
     with pytest.raises(TrackFileError, match="version 7, this program reads 1 and 2"):
+        load_track(tmp_path / "b.npz")
+
+
+def test_a_frame_without_modes_is_refused(tmp_path: Path) -> None:
+    write_track(tmp_path / "track.npz")
+    arrays = arrays_of(tmp_path / "track.npz")
+    arrays["log_weight"][1] = -np.inf
+    np.savez(tmp_path / "b.npz", **arrays)
+    with pytest.raises(TrackFileError, match=r"b\.npz: row 1: no mode; expected one or more"):
         load_track(tmp_path / "b.npz")
 
 

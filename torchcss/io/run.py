@@ -17,7 +17,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from torchcss.body.bases import on_origin, pose_track
@@ -194,10 +193,9 @@ def body_of_track(track: Track, body: BodyModel | None = None) -> BodyModel:
             f"parameters {', '.join(track.state_names)}"
         )
     body = on_origin(body)
-    rows = np.flatnonzero(track.num_modes > 0)
     state, base, target = (
         torch.from_numpy(array)
-        for array in (track.state[rows, 0], track.base_transform[rows], track.joints_world[rows, 0])
+        for array in (track.state[:, 0], track.base_transform, track.joints_world[:, 0])
     )
     gap = (pose_track(body, state, base).joints - target).abs()
     if gap.numel() and float(gap.max()) > TOLERANCE:

@@ -419,6 +419,8 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
             values[name] = tuple(str(entry) for entry in array)
         else:
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
+    if (empty := (values["log_weight"] == -np.inf).all(1)).any():
+        raise TrackFileError(f"{path}: row {empty.argmax()}: no mode; expected one or more a frame")
     power = float(values.pop(_POWER_KEY))
     if not 0 < power < np.inf:
         raise TrackFileError(f"{path}: {_POWER_KEY}: expected a positive power, got {power:g}")

@@ -34,11 +34,11 @@ from torchcss.io.tracks import TRACK_NAME, Track
 from torchcss.show.style import DEVIATIONS, OKABE_ITO, save_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of
 from torchcss.show.track_plots import (
+    check_not_empty,
     label,
     mode_colour,
     modes_figure,
     most_open_frame,
-    rows_with_modes,
     sheet_of,
     shrunk,
     side_view_figure,
@@ -87,7 +87,8 @@ def plot_track(
         TorchcssError: If the body is not known, the folder cannot be written, or a picture cannot
             be read.
     """
-    track, rows = run.track._replace(body=run.body), rows_with_modes(run.track)
+    track = run.track._replace(body=run.body)
+    check_not_empty(track)
     usual = "plots" if run.path.name == TRACK_NAME else f"{run.path.stem}_plots"
     out = prepare_output_folder(run.folder / usual if out is None else out)
     camera = run.cameras[0].camera if run.cameras else None
@@ -101,7 +102,7 @@ def plot_track(
         "side_view": side_view_figure(track, frame, camera=camera),
     }
     if has_pictures(run):
-        chosen = np.unique(rows[np.linspace(0, len(rows) - 1, _SHEET).round().astype(int)])
+        chosen = np.unique(np.linspace(0, len(track.frames) - 1, _SHEET).round().astype(int))
         found = [(row, shrunk(image)) for row, image in pictures_of(run, chosen, anew=anew)]
         figures["frames"] = sheet_of(
             [image for _, image in found],
@@ -121,16 +122,16 @@ def joints_figure(track: Track, *, camera: Camera | None = None) -> Figure:
     Raises:
         TrackFileError: If the track has no frames, or its body cannot be told.
     """
-    rows = rows_with_modes(track)
+    check_not_empty(track)
     names = [n for n in SHOWN_JOINTS if n in track.joint_names] or list(track.joint_names)
     chosen = [track.joint_names.index(name) for name in names]
     body = body_of_track(track)
-    pose = pose_track(
-        body, torch.from_numpy(track.state[rows, 0]), torch.from_numpy(track.base_transform[rows])
+    state, base, covariance = map(
+        torch.from_numpy, (track.state[:, 0], track.base_transform, track.covariance[:, 0])
     )
-    covariance = torch.from_numpy(track.covariance[rows, 0])
+    pose = pose_track(body, state, base)
     spread = joint_covariance(body, pose, covariance, held=track.held).numpy()
-    places, labels = track.joints_world[rows], ("world x", "world y", "world z")
+    places, labels = track.joints_world, ("world x", "world y", "world z")
     if camera is not None:
         # Up is minus the camera's y.
         turn = camera.R_camera_world.double().cpu().numpy() * [[1], [-1], [1]]
@@ -144,7 +145,7 @@ def joints_figure(track: Track, *, camera: Camera | None = None) -> Figure:
     grid = figure.subplots(len(names), 3, sharex=True, squeeze=False)
     for panels, name, joint in zip(grid, names, chosen, strict=True):
         for axis, axes in enumerate(panels):
-            _draw(axes, track, rows, places[:, :, joint, axis], deviation[:, joint, axis])
+            _draw(axes, track, places[:, :, joint, axis], deviation[:, joint, axis])
         panels[0].set_ylabel(name.replace("_", " "), fontsize=9)
     for axes, direction in zip(grid[0], labels, strict=True):
         axes.set_title(f"{direction} (metres)", fontsize=10)
@@ -165,12 +166,12 @@ def angles_figure(track: Track) -> Figure:
     Raises:
         TrackFileError: If the track has no frames, or its body cannot be told.
     """
-    rows = rows_with_modes(track)
+    check_not_empty(track)
     body = body_of_track(track)
     lower, upper = body.lower.numpy(), body.upper.numpy()
-    deviation = np.sqrt(np.diagonal(track.covariance[rows, 0], axis1=-2, axis2=-1).clip(min=0))
-    base = track.base_transform[rows]
-    moved = np.flatnonzero((np.abs(np.diff(base, axis=0)) > 1e-9).any((1, 2))) + 1
+    deviation = np.sqrt(np.diagonal(track.covariance[:, 0], axis1=-2, axis2=-1).clip(min=0))
+    step = np.abs(np.diff(track.base_transform, axis=0))
+    moved = np.flatnonzero((step > 1e-9).any((1, 2))) + 1
     columns = min(len(track.state_names), 5)
     count = math.ceil(len(track.state_names) / columns)
     # Margins in inches: measuring the labels of so many panels takes as long as drawing them.
@@ -185,9 +186,9 @@ def angles_figure(track: Track) -> Figure:
         axes.set_visible(False)
     for index, (axes, name) in enumerate(zip(grid.flat, track.state_names, strict=False)):
         factor, unit = (180 / math.pi, "degrees") if body.is_angle[index] else (1.0, "m")
-        values = factor * track.state[rows, :, index]
+        values = factor * track.state[:, :, index]
         breaks = moved if name in ROOT_NAMES else moved[:0]
-        _draw(axes, track, rows, values, factor * deviation[:, index], breaks=breaks)
+        _draw(axes, track, values, factor * deviation[:, index], breaks=breaks)
         low, high = axes.get_ylim()
         for limit in (factor * lower[index], factor * upper[index]):
             if low - 0.3 * (high - low) <= limit <= high + 0.3 * (high - low):
@@ -214,9 +215,9 @@ def spectra_figure(track: Track) -> Figure:
     Raises:
         TrackFileError: If the track has no frames.
     """
-    rows = rows_with_modes(track)
+    check_not_empty(track)
     names = [name.replace("_", " ") for name in track.state_names]
-    covariance, times = track.covariance[rows, 0], track.times[rows]
+    covariance, times = track.covariance[:, 0], track.times
     values, vectors = np.linalg.eigh(covariance)
     deviation = np.sqrt(values.clip(min=0))
     figure = Figure(figsize=(12.0, 8.2), layout="constrained")
@@ -285,15 +286,14 @@ def _draw_direction(axes: Axes, direction: np.ndarray, names: list[str]) -> None
 def _draw(
     axes: Axes,
     track: Track,
-    rows: np.ndarray,
     values: Float[np.ndarray, "t k"],
     deviation: Float[np.ndarray, " t"],
     *,
     breaks: np.ndarray | None = None,
 ) -> None:
     """Draw the best mode's line and band, and the other modes as dots."""
-    times, best = track.times[rows], values[:, 0]
-    weight = np.exp(track.log_weight[rows])
+    times, best = track.times, values[:, 0]
+    weight = np.exp(track.log_weight)
     for mode in range(1, values.shape[1]):
         there = weight[:, mode] > 0
         share = (weight[there, mode] / weight[there, 0]).clip(max=1.0)
@@ -303,7 +303,7 @@ def _draw(
             c=np.column_stack([colour, 0.15 + 0.85 * share]),
         )  # fmt: skip
     wide = DEVIATIONS * deviation
-    for piece in np.split(np.arange(len(rows)), [] if breaks is None else breaks):
+    for piece in np.split(np.arange(len(times)), [] if breaks is None else breaks):
         axes.fill_between(
             times[piece], (best - wide)[piece], (best + wide)[piece], color=mode_colour(0),
             alpha=0.45, lw=0, zorder=1,

@@ -28,9 +28,9 @@ from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of
 from torchcss.show.track_plots import (
+    check_not_empty,
     modes_figure,
     most_open_frame,
-    rows_with_modes,
     side_view_figure,
 )
 from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset
@@ -85,10 +85,11 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
         TorchcssError: If the track has no frames, its body is not known, a picture cannot be read,
             or the file cannot be written.
     """
-    track, rows = run.track._replace(body=run.body), rows_with_modes(run.track)
+    track = run.track._replace(body=run.body)
+    check_not_empty(track)
     camera = run.cameras[0].camera if run.cameras else None
     sections = (
-        ("Film", _film(run, rows, anew=anew)),
+        ("Film", _film(run, anew=anew)),
         (
             "The modes from the side",
             "<p>The frame whose weight is spread over most modes. Where the lines part, one camera "
@@ -112,11 +113,12 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
     return run.folder / name
 
 
-def _film(run: Run, rows: np.ndarray, *, anew: bool) -> str:
+def _film(run: Run, *, anew: bool) -> str:
     """The film, small enough to lie in the page."""
     if not has_pictures(run):
         return "<p>The video is not where it was; say where with <code>--video</code>.</p>"
-    rows = rows[:: math.ceil(len(rows) / MOST_PICTURES)]
+    count = len(run.track.frames)
+    rows = range(0, count, math.ceil(count / MOST_PICTURES))
     times = run.track.times[rows]
     rate = (len(rows) - 1) / float(times[-1] - times[0]) if len(rows) > 1 else 1.0
     still = BytesIO()

@@ -113,7 +113,7 @@ def side_view_figure(
             unknown ones NaN.
 
     Raises:
-        ConfigurationError: If the track has no mode in this frame.
+        ConfigurationError: If the track does not have this frame.
         TrackFileError: If the body cannot be told.
         ShapeError: If a place of the reference is not three numbers.
     """
@@ -197,16 +197,14 @@ def count_apart(joints: Float[np.ndarray, "k j 3"]) -> int:
     return len(kept)
 
 
-def rows_with_modes(track: Track) -> np.ndarray:
-    """Rows of the track that have modes.
+def check_not_empty(track: Track) -> None:
+    """Refuse a track without frames.
 
     Raises:
-        TrackFileError: If there are none.
+        TrackFileError: If it has none.
     """
-    rows = np.flatnonzero(track.num_modes > 0)
-    if not rows.size:
+    if not len(track.frames):
         raise TrackFileError("the track has no frames; there is nothing to show")
-    return rows
 
 
 def effective_number(track: Track) -> Float[np.ndarray, " t"]:
@@ -222,8 +220,7 @@ def effective_number(track: Track) -> Float[np.ndarray, " t"]:
 
 def most_open_frame(track: Track) -> int:
     """Number of the frame whose belief is spread over most modes."""
-    shown = np.where(track.num_modes > 0, effective_number(track), 0.0)
-    return int(track.frames[shown.argmax()])
+    return int(track.frames[effective_number(track).argmax()])
 
 
 def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figure:
@@ -239,7 +236,7 @@ def modes_figure(track: Track, summary: Mapping[str, Any] | None = None) -> Figu
     Raises:
         TrackFileError: If the track has no frames.
     """
-    rows_with_modes(track)
+    check_not_empty(track)
     events = [] if summary is None else summary.get("events", [])
     times = track.times
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
@@ -377,12 +374,13 @@ def shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "r s 3"]:
 
 def _row_of(track: Track, frame: int) -> int:
     """Which row of the track a frame is."""
-    rows = np.flatnonzero((track.frames == frame) & (track.num_modes > 0))
-    if not rows.size:
-        known = track.frames[track.num_modes > 0]
-        span = f"frames {known.min()} to {known.max()}" if known.size else "no frames"
-        raise ConfigurationError(f"the track has no mode in frame {frame}; it covers {span}")
-    return int(rows[0])
+    check_not_empty(track)
+    if frame not in track.frames:
+        raise ConfigurationError(
+            f"the track has no frame {frame}; it covers frames {track.frames[0]} to "
+            f"{track.frames[-1]}"
+        )
+    return int(np.flatnonzero(track.frames == frame)[0])
 
 
 def _first_of_links(body: BodyModel) -> list[int]:

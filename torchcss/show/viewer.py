@@ -48,7 +48,7 @@ from torchcss.io.tracks import FrameModes
 from torchcss.show.overlay import PALETTE
 from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_pictures import pictures_of
-from torchcss.show.track_plots import EXPLANATION_M, bones_of, count_apart, rows_with_modes
+from torchcss.show.track_plots import EXPLANATION_M, bones_of, check_not_empty, count_apart
 from torchcss.show.viewer_layout import layout, rerun, world_axes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
@@ -107,7 +107,7 @@ def view_track(
         TorchcssError: As `open_recording`; if the body is not known; if a picture cannot be read;
             if the recording cannot be written.
     """
-    rows_with_modes(run.track)
+    check_not_empty(run.track)
     track, camera = run.track, run.cameras[0].camera if run.cameras else None
     best = track.joints_world[:, 0]
     up, _ = up_axis(track.joint_names, best, track.base_transform, camera_up(camera))
@@ -132,7 +132,7 @@ def shown_frames(run: Run, *, anew: bool = False) -> Iterator[ShownFrame]:
         run: The run.
         anew: Whether to draw over the video even where the tracker left an overlay.
     """
-    rows, lost = rows_with_modes(run.track), False
+    rows, lost = range(len(run.track.frames)), False
     pictures = pictures_of(run, rows, anew=anew)
     changes = {int(event["frame"]): event["event"] for event in run.summary.get("events", [])}
     for row in rows:

@@ -250,9 +250,9 @@ def _frame_of_file(
     axis = world_up
     if world_up == "auto":
         picture_up = camera_up(track.cameras[0].camera if track.cameras else None)
-        seen = track.num_modes > 0  # all of them: parts of one track stand in one frame
+        # Of all frames, also those that are left out: parts of one track stand in one frame.
         axis, agreement = up_axis(
-            track.joint_names, track.joints_world[seen, 0], track.base_transform[seen], picture_up
+            track.joint_names, track.joints_world[:, 0], track.base_transform, picture_up
         )
         tells = set(_UPRIGHT) <= set(track.joint_names)
         what = "body's mean" if tells else "base's" if picture_up is None else "picture's upward"
