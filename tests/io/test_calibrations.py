@@ -380,6 +380,124 @@ def test_colmaps_binary(tmp_path: Path) -> None:
             load_camera(path)
 
 
+TURN = about(1, np.array(0.4)) @ about(0, np.array(-0.3))
+"""World to camera of some pictures."""
+
+
+def quaternion(R: np.ndarray) -> list[float]:
+    w = 0.5 * np.sqrt(1 + np.trace(R))
+    return [float(w), *((R[(2, 0, 1), (1, 2, 0)] - R[(1, 2, 0), (2, 0, 1)]) / (4 * w)).tolist()]
+
+
+def colmap_model(folder: Path, form: str, rows: list[tuple[Any, list[float], str]]) -> None:
+    """A model of one camera and pictures: rotation, translation and name of each."""
+    if form == "txt":
+        (folder / "cameras.txt").write_text(f"1 PINHOLE 640 480 {FX} {FY} {CX + 0.5} {CY + 0.5}\n")
+        lines = ["#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"]
+        for number, (R, t, name) in enumerate(rows, start=1):
+            lines.append(" ".join(map(str, [number, *quaternion(R), *t, 1, name])))
+            lines.append("10.5 20.5 -1 11 21 7 1 2 3 4.0 5 6" if number % 2 else "")
+        (folder / "images.txt").write_text("\n".join(lines) + "\n")
+        return
+    camera = struct.pack("<QiiQQ4d", 1, 1, 1, 640, 480, FX, FY, CX + 0.5, CY + 0.5)
+    (folder / "cameras.bin").write_bytes(camera)
+    data = struct.pack("<Q", len(rows))
+    for number, (R, t, name) in enumerate(rows, start=1):
+        data += struct.pack("<I7dI", number, *quaternion(R), *t, 1) + name.encode() + b"\0"
+        data += struct.pack("<Q", 2) + struct.pack("<2dq", 10.5, 20.5, -1) * 2
+    (folder / "images.bin").write_bytes(data)
+
+
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_places_of_colmaps_pictures(tmp_path: Path, form: str) -> None:
+    rows = [
+        (TURN, [0.1, 0.2, 3.0], "left.jpg"), (np.eye(3), [0.0, 0.0, 2.0], "right 2.jpg"),
+        (TURN.T, [0.5, 0.0, 1.0], "top/000001.jpg"),
+    ]  # fmt: skip
+    colmap_model(tmp_path, form, rows)
+    if form == "txt":
+        text = (tmp_path / "images.txt").read_text()
+        (tmp_path / "images.txt").write_text("# units: 0.5\n" + text)
+    # The camera of many places has none; that of one is where its only picture was taken.
+    check(tmp_path, [0.0] * 5)
+    places = {"left.mp4": 0, "right2.mp4": 1, "top.mp4": 2, "top": 2}
+    for video, number in places.items():
+        loaded = load_camera(tmp_path, video=tmp_path / video)
+        R, t, name = rows[number]
+        assert loaded.camera.name == name
+        if form == "bin":  # it cannot say a unit
+            assert not loaded.metric
+            assert "unknown unit" in str(loaded.units_note)
+            entry = read_entries(tmp_path)[name]
+            np.testing.assert_allclose(entry.rotation, R, atol=1e-12)
+            np.testing.assert_allclose(entry.translation, t)
+            continue
+        assert loaded.metric
+        assert "need not have an axis upwards" in str(loaded.units_note)
+        np.testing.assert_allclose(loaded.camera.R_camera_world, R, atol=1e-12)
+        np.testing.assert_allclose(loaded.camera.t_camera_world, 0.5 * np.array(t))
+    check(tmp_path, [0.0] * 5, video=tmp_path / "other.mp4")
+    colmap_model(tmp_path, form, rows[:1])
+    assert load_camera(tmp_path).camera.name == "1"
+    np.testing.assert_allclose(read_entries(tmp_path)["1"].rotation, TURN, atol=1e-12)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_places_of_nerfstudios_pictures(tmp_path: Path, shared: bool) -> None:
+    """Camera to world, with the camera's y up and z backwards."""
+    numbers = {"fl_x": FX, "fl_y": FY, "cx": CX + 0.5, "cy": CY + 0.5, "w": 640, "h": 480}
+    poses = {"images/left.png": (TURN, [0.1, 0.2, 3.0]), "images/right.png": (TURN.T, [0, 0, 2.0])}
+    frames = []
+    for name, (R, t) in poses.items():
+        matrix = np.eye(4)
+        matrix[:3, :3] = R.T @ np.diag([1, -1, -1])
+        matrix[:3, 3] = -R.T @ np.array(t)
+        own = {} if shared else numbers
+        frames.append({"file_path": name, "transform_matrix": matrix.tolist(), **own})
+    content = {"camera_model": "PINHOLE", "frames": frames, **(numbers if shared else {})}
+    path = tmp_path / "transforms.json"
+    for units in (None, 0.5):
+        path.write_text(json.dumps(content | {"units": units}))
+        for video, (R, t) in zip(("left.mp4", "right.mp4"), poses.values(), strict=True):
+            loaded = load_camera(path, video=tmp_path / video)
+            np.testing.assert_allclose(loaded.camera.K, K)
+            assert loaded.metric == (units is not None)
+            if loaded.metric:
+                np.testing.assert_allclose(loaded.camera.R_camera_world, R, atol=1e-12)
+                expected = 0.5 * np.array(t)
+                np.testing.assert_allclose(loaded.camera.t_camera_world, expected, atol=1e-12)
+    if shared:
+        check(path, [0.0] * 5)  # the camera of many places has none
+    else:
+        with pytest.raises(CameraError, match=r"several cameras, .*right.png"):
+            load_camera(path)
+    frames[0]["transform_matrix"] = [1, 2]
+    path.write_text(json.dumps(content))
+    with pytest.raises(CameraError, match=r"left\.png: expected fl_x"):
+        load_camera(path)
+
+
+def test_colmaps_pictures_that_are_none(tmp_path: Path) -> None:
+    colmap_model(tmp_path, "txt", [(TURN, [0.1, 0.2, 3.0], "left.jpg")])
+    text = (tmp_path / "images.txt").read_text()
+    (tmp_path / "images.txt").write_text(text.replace(" 1 left", " 7 left"))
+    with pytest.raises(CameraError, match=r"images.txt: picture '1': not COLMAP's"):
+        load_camera(tmp_path)
+    colmap_model(tmp_path, "bin", [(TURN, [0.1, 0.2, 3.0], "left.jpg")])
+    (tmp_path / "images.bin").write_bytes((tmp_path / "images.bin").read_bytes()[:70])
+    with pytest.raises(CameraError, match=r"expected COLMAP's images.bin"):
+        load_camera(tmp_path / "cameras.bin")
+
+
+def test_numbers_that_yaml_takes_for_text(tmp_path: Path) -> None:
+    """Other writers leave out the point, or what is before it."""
+    text = yaml_matrix("camera_matrix", K, 3)
+    path = tmp_path / "a.yml"
+    path.write_text(OPENCV + text + "k1: 1e-05\nk2: -.25\np1: -2E-4\np2: 5.\n")
+    found = load_camera(path).camera.distortion
+    np.testing.assert_allclose(found, [1e-5, -0.25, -2e-4, 5, 0])
+
+
 def test_a_folder_of_openposes(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match="no calibration in this folder"):
         load_camera(tmp_path)

@@ -9,7 +9,7 @@
 | OpenCV, ROS | YAML, JSON or XML with `camera_matrix`; `M1`, `D1`, `M2`, `D2` of a pair |
 | OpenPose, Metashape | XML with `Intrinsics`, or with `f`, `cx`, `cy` from the middle |
 | Kalibr | YAML: `cam0` with `intrinsics` |
-| COLMAP | `cameras.txt` or `cameras.bin`, or their folder |
+| COLMAP | `cameras.txt` or `cameras.bin`, or their folder; `images` beside say places |
 | KITTI, ROS | `.txt`: numbers below or behind what they are |
 | MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
 | arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone; of several cameras |
@@ -17,7 +17,8 @@
 Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
 the corner of the image, MATLAB's from 1; both are brought to pixel centres at integers. A 3 x 4
 matrix P that projects points of the world is taken apart; matrices by columns are turned. A folder
-may hold a file for every camera.
+may hold a file for every camera. Places from which single pictures were taken (COLMAP, Nerfstudio)
+are entries by the pictures' names.
 
 Call `read_entries`.
 """
@@ -38,6 +39,7 @@ import numpy as np
 import yaml
 
 from torchcss.body.files.xml import parse_xml
+from torchcss.body.rotations import from_quaternion
 from torchcss.errors import CameraError, optional_package
 from torchcss.files import (
     load_array,
@@ -74,6 +76,7 @@ class Entry(NamedTuple):
             OpenCV's fisheye lens are its distortion), "inverse", or True of another kind.
         note: What was assumed, for the user.
         name: What the camera calls itself.
+        is_picture: It is a camera where one of many pictures was taken, by that picture's name.
     """
 
     K: Any
@@ -86,6 +89,7 @@ class Entry(NamedTuple):
     fisheye: Any = False
     note: str | None = None
     name: Any = None
+    is_picture: bool = False
 
 
 _WORDS = {
@@ -142,6 +146,8 @@ _ROUNDING = 1e-3
 _INVERSE = re.compile("inverse", re.IGNORECASE)
 """RealSense's model whose coefficients undo the distortion."""
 
+_NUMBERS = re.compile(r"[-+0-9.eE\s]+")
+
 _FISHEYE_NUMBERS = re.compile("fish_?eye_?(param|model|coeff)", re.IGNORECASE)
 
 _MOST_BYTES = 2**26
@@ -151,6 +157,7 @@ _DEEPEST = 50
 """Brackets in brackets of a calibration in YAML."""
 
 _OTHERS = {
+    ".sfm .abc": "Meshroom's; give K, image_size_wh and distortion in a cameras.json",
     ".pickle .pkl": "a pickle, from which code may run: not read; save K, dist, R and t with "
     "numpy.savez",
     ".qca.txt .xcp": "the calibration of a motion capture system; save it as Pose2Sim's Calib.toml",
@@ -495,6 +502,9 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
         raise unexpected(CameraError, path, "an object 'cameras' with one under each name", content)
     if "RadialDistortion" in content and _has_camera(content):
         return {path.stem: _matlab_entry(content)}
+    frames = listed(content.get("frames"))
+    if pictures := [each for each in frames if isinstance(each, dict) and _OF_NERF in each]:
+        return _nerf_entries(path, content, pictures)
     cameras = _stacked(content) or first_of(content, ("cameras",))
     if cameras is None and (_has_camera(content) or _numbered(content)):
         return _alone(path, content)
@@ -519,6 +529,31 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
         else _entry(each, units if said is None else said)
         for name, each in cameras.items()
     }
+
+
+_OF_NERF = "transform_matrix"
+"""Where a picture was taken, camera to world, with OpenGL's axes: y up, z backwards."""
+
+
+def _nerf_entries(
+    path: Path, content: Mapping[str, Any], pictures: Sequence[Mapping[str, Any]]
+) -> dict[str, Entry]:
+    """Nerfstudio's camera and pictures, each of which may have numbers of its own."""
+    rest = {word: each for word, each in content.items() if word != "frames"}
+    cameras = _alone(path, rest) if _has_camera(rest) else {}
+    own: dict[str, Entry] = {}
+    for index, picture in enumerate(pictures):
+        name = str(picture.get("file_path", index))
+        pose = _square(picture[_OF_NERF], 4)
+        if pose is None or not _has_camera({**rest, **picture}):
+            raise CameraError(
+                f"{path}: {name}: expected fl_x, fl_y, cx, cy and a {_OF_NERF} of 4 x 4 numbers"
+            )
+        R = np.diag([1.0, -1.0, -1.0]) @ pose[:3, :3].T
+        own[name] = _entry({**rest, **picture}, rest.get("units"))._replace(
+            rotation=R.tolist(), translation=(-R @ pose[:3, 3]).tolist(), is_picture=True
+        )
+    return _by_pictures(cameras, dict.fromkeys(cameras, own) or {"": own})
 
 
 def _read_toml(path: Path) -> dict[str, Entry]:
@@ -582,7 +617,8 @@ def _read_text(path: Path) -> dict[str, Entry]:
         values = {"K": next(iter(found.values()))}
     if _has_camera(values) or _numbered(values):
         return _alone(path, values)
-    return _colmap_entries({w: re.split(r"[\s,;]+", line) for w, line in lines.items()})
+    rows = {w: re.split(r"[\s,;]+", line) for w, line in lines.items()}
+    return _with_places(path, _colmap_entries(rows), _said_unit(text))
 
 
 def _colmap_entries(rows: Mapping[str, Sequence[str]]) -> dict[str, Entry]:
@@ -625,7 +661,78 @@ def _read_binary(path: Path) -> dict[str, Entry]:
             words = [str(number), name, *map(str, size), *map(repr, values)]
             rows[f"{path}: camera {number}"] = words
             at += 24 + 8 * length
-    return _colmap_entries(rows)
+    return _with_places(path, _colmap_entries(rows), None)
+
+
+def _said_unit(text: str) -> Any:
+    """The unit that a comment says, `# units: mm` or metres per unit: COLMAP has no word for it."""
+    if (match := re.search(r"(?im)^#\s*units?\s*[:=]\s*(\S+)", text)) is None:
+        return None
+    with suppress(ValueError):
+        return float(match[1])
+    return match[1]
+
+
+def _with_places(path: Path, entries: dict[str, Entry], unit: Any) -> dict[str, Entry]:
+    """COLMAP's cameras with their pictures: places of `images.txt` or `images.bin` beside.
+
+    A camera that took all its pictures from one place stands there.
+    """
+    beside = [path.with_name(f"images{suffix}") for suffix in (path.suffix, ".bin", ".txt")]
+    images = next((each for each in beside if each.is_file()), None)
+    if images is None:
+        return entries
+    if images.suffix == ".bin":
+        found = _binary_images(images)
+    else:
+        text = read_text(images, CameraError)
+        unit = _said_unit(text) if unit is None else unit
+        # The lines between are of points: numbers alone.
+        rows = [line.split(maxsplit=9) for line in text.splitlines() if line.strip()[:1] != "#"]
+        found = [row for row in rows if len(row) == 10 and not _NUMBERS.fullmatch(row[9])]
+    placed: dict[str, dict[str, Entry]] = {}
+    for row in found:
+        with refusing(CameraError, f"{images}: picture {shortened(row[0])}: not COLMAP's"):
+            *pose, camera, picture = row[1:]
+            numbers = real_numbers([*map(float, pose)], picture, CameraError)
+            R = from_quaternion(numbers[:4] / np.linalg.norm(numbers[:4]))
+            placed.setdefault(str(camera), {})[str(picture)] = entries[str(camera)]._replace(
+                rotation=R.tolist(),
+                translation=numbers[4:7].tolist(),
+                units=unit,
+                is_picture=True,
+                note=None if unit is None else "its world need not have an axis upwards (COLMAP)",
+            )
+    return _by_pictures(entries, placed)
+
+
+def _by_pictures(
+    entries: Mapping[str, Entry], placed: Mapping[str, Mapping[str, Entry]]
+) -> dict[str, Entry]:
+    """Cameras, where they stand if they have one place, and their pictures by name."""
+    cameras, pictures = dict(entries), {}
+    for name, own in placed.items():
+        first = next(iter(own.values()))
+        if name in cameras and all(each[3:5] == first[3:5] for each in own.values()):
+            cameras[name] = first._replace(is_picture=False)
+        pictures |= own
+    return {**pictures, **cameras}
+
+
+def _binary_images(path: Path) -> list[list[Any]]:
+    """The rows of COLMAP's binary images, as its text has them."""
+    data, at = read_bytes(path, CameraError), 8
+    rows: list[list[Any]] = []
+    with refusing(CameraError, f"{path}: expected COLMAP's images.bin"):
+        (count,) = struct.unpack_from("<Q", data)
+        for _ in range(count):
+            number, *pose, camera = struct.unpack_from("<I7dI", data, at)
+            end = data.index(0, at + 64)
+            name = data[at + 64 : end].decode()
+            rows.append([number, *pose, camera, name])
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            at = end + 9 + 24 * points
+    return rows
 
 
 def _read_yaml(path: Path) -> dict[str, Entry]:
@@ -804,6 +911,11 @@ def _whole(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int | str:
     return node.value if is_text else yaml.SafeLoader.construct_yaml_int(loader, node)
 
 
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+(\.\d*)?[eE][-+]?\d+|\.\d+([eE][-+]?\d+)?|\d+\.\d*)$"),
+    list("-+.0123456789"),
+)  # 1e-05 and -.5, which YAML's first version took for text
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 

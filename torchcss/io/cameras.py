@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -362,7 +362,8 @@ def _own_frame_note(name: str, entry: Entry) -> str | None:
 
 
 def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: Path | None) -> str:
-    names = ", ".join(entries)
+    cameras = [each for each, entry in entries.items() if not entry.is_picture]
+    names = ", ".join(cameras) if cameras else shortened(", ".join(entries))
     if not entries:
         raise CameraError(f"{path}: no cameras in the file")
     if name is not None:
@@ -372,19 +373,33 @@ def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: P
                 return found[0]
             raise CameraError(f"{path}: no camera {name!r}; the file has {names}")
         return name
-    if len(entries) == 1:
-        return next(iter(entries))
+    alone = next(iter(cameras or entries)) if len(cameras or entries) == 1 else None
+    if len(entries) == 1 or (video is None and alone is not None):
+        return next(iter(cameras or entries))
     if video is None:
         raise CameraError(f"{path}: several cameras, {names}: say which (--camera-name)")
     exact = [name for name, entry in entries.items() if entry.video == video.name]
-    alike = [name for name in entries if _letters(name) == _letters(video.stem)]
-    for found in (exact, alike):
+    alike = [name for name in cameras if _letters(name) == _letters(video.stem)]
+    pictures = [
+        name
+        for name, entry in entries.items()
+        if entry.is_picture and _letters(video.stem) in map(_letters, _stems(name))
+    ]
+    for found in (exact, alike, pictures):
         if len(found) == 1:
             return found[0]
+    if alone is not None:
+        return alone
     raise CameraError(
         f"{path}: no single camera of {video.name}; say which of {names} it is (--camera-name, "
         "or --other-cameras for a further video)"
     )
+
+
+def _stems(picture: str) -> tuple[str, str]:
+    """A picture's name without its suffix, and the name of its folder."""
+    path = PurePosixPath(picture.replace("\\", "/"))
+    return path.stem, path.parent.name
 
 
 def _letters(name: str) -> str:
