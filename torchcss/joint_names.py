@@ -335,9 +335,15 @@ def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]])
     places = {place for _, place in spelt}
     # `arm` and `leg` are a limb's upper or lower part only beside words for the other.
     alone = not places & {"upleg", "upperleg", "thigh", "forearm", "lowerarm"}
+    # Beside a shin, and no word for what is above it, `leg` is the thigh (SOMA).
+    is_thigh = bool(places & {"shin", "shank", "calf"}) and not any(
+        side and place in table["hip"] for side, place in spelt
+    )
     found: dict[str, int] = {}
     for limb, words in table.items():
-        if alone:
+        if is_thigh and limb in ("hip", "knee"):
+            words = ("leg",) if limb == "hip" else tuple(word for word in words if word != "leg")
+        elif alone:
             words = tuple(word for word in words if word not in ("arm", "leg"))
         for side in ("l_", "r_"):
             there = [word for word in words if (side, word) in spelt]

@@ -161,6 +161,21 @@ def test_a_skeleton_without_motion(tmp_path: Path, motion: str) -> None:
         read_motion_capture(path)
 
 
+@pytest.mark.parametrize("frames", [0, 2])
+def test_a_bvh_whose_positions_are_all_zero(tmp_path: Path, frames: int) -> None:
+    """Every joint has six channels, and all positions but the root's are zero."""
+    three, six = "CHANNELS 3 ", "CHANNELS 6 Xposition Yposition Zposition "
+    rows = "\n".join([" ".join(["0"] * (6 + 54))] * frames)
+    motion = f"MOTION\nFrames: {frames}\nFrame Time: 0.04\n{rows}\n"
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(motion=motion).replace(three, six))
+    body = load_body(path)
+    joints = body.pose(torch.zeros(body.num_parameters, dtype=torch.float64)).joints
+    gap = joints[body.joint_index("skullbase")] - joints[body.joint_index("l_ankle")]
+    assert float(gap[1]) > 0.9
+    assert any("positions of joints are all zero" in note for note in body.notes)
+
+
 def test_a_bvh_of_two_people_is_told(tmp_path: Path) -> None:
     path = tmp_path / "a.bvh"
     one = bvh(motion="").partition("\n")[2]

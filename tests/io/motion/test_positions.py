@@ -23,6 +23,7 @@ from torchcss.io.motion.positions import (
     read_motion_capture,
     resample_motion,
 )
+from torchcss.joint_names import skeleton_joint_names
 
 BVH = """HIERARCHY
 ROOT Hips
@@ -161,6 +162,19 @@ def test_positions_take_the_place_of_offsets(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.rest, plain.rest)
     stretched = found.joints[1, 1] - found.joints[1, 0]
     np.testing.assert_allclose(stretched, 1.1 * (plain.joints[1, 1] - plain.joints[1, 0]))
+
+
+def test_positions_that_are_all_zero_leave_the_offsets(tmp_path: Path) -> None:
+    """Other programs write them for every joint, and nothing into them."""
+    six = "CHANNELS 6 Xposition Yposition Zposition Xrotation"
+    text = BVH.replace("CHANNELS 3 Xrotation", six)
+    text = text.replace("10 20 30 40", "10 20 30 0 0 0 40")
+    text = text.replace("11 20 31 40", "11 20 31 0 0 0 40")
+    plain = read_motion_capture(write_bvh(tmp_path))
+    found = read_motion_capture(write_bvh(tmp_path, text))
+    np.testing.assert_allclose(found.joints, plain.joints)
+    assert any("positions of joints are all zero" in line for line in found.report)
+    assert not any("all zero" in line for line in plain.report)
 
 
 def test_acclaim_by_its_definition(tmp_path: Path) -> None:
@@ -379,6 +393,16 @@ def test_names_of_limbs(names: tuple[str, ...]) -> None:
     assert found == ("l_shoulder", "r_shoulder", "l_hip", "r_hip")
     assert index == (4, 5, 0, 1)
     np.testing.assert_array_equal(positions, motion.joints[:, [4, 5, 0, 1]])
+
+
+def test_a_leg_above_a_shin_is_the_thigh() -> None:
+    """SOMA's skeleton, whose thigh is called as others call the shin."""
+    names = ("Hips", "LeftLeg", "LeftShin", "LeftFoot", "RightLeg", "RightShin", "LeftArm",
+             "LeftForeArm")  # fmt: skip
+    expected = (None, "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee", "l_shoulder", "l_elbow")
+    assert skeleton_joint_names(names) == expected
+    usual = ("LeftUpLeg", "LeftLeg", "LeftFoot", "LeftForeArm")
+    assert skeleton_joint_names(usual) == ("l_hip", "l_knee", "l_ankle", "l_elbow")
 
 
 def test_without_hips_there_is_nothing_to_follow() -> None:

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.body.chain import JointSpecification
-from torchcss.body.files.bvh_parser import Segment, parse_bvh
+from torchcss.body.files.bvh_parser import Segment, parse_bvh, without_empty_positions
 from torchcss.body.rotations import about, as_rows, as_vector
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.joint_names import skeleton_joint_names
@@ -89,6 +89,7 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTr
         ConfigurationError: If the units are none.
     """
     segments, values, _ = parse_bvh(path)
+    segments, empty = without_empty_positions(segments, values)
     num_frames, is_z_up = len(values), stands_along_z(segments, values)
     if not num_frames:  # a skeleton alone: one pose, all channels zero
         values = np.zeros((1, values.shape[1]))
@@ -131,7 +132,7 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTr
             joints.append(
                 JointSpecification(name=name, link=segment.name, parent=parent, translation=at)
             )
-    notes = [unit_line, _limits_line(num_frames, has_motion, held)]
+    notes = [unit_line, _limits_line(num_frames, has_motion, held), *empty]
     if is_z_up:
         notes.append(Z_UP_NOTE)
     names = tuple(segment.name for segment in segments)

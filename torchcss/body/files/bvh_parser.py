@@ -199,6 +199,31 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
     return segments, values, rate
 
 
+def without_empty_positions(
+    segments: Sequence[Segment], values: Float[np.ndarray, "t c"]
+) -> tuple[list[Segment], list[str]]:
+    """The same without position channels that hold nothing, and a line that says so.
+
+    Some programs write six channels for every joint, and zeros for the positions of all but the
+    root: then the offsets hold, which positions would take the place of.
+    """
+    columns = {
+        index: [turn.column for turn in segment.turns if not turn.is_rotation]
+        for index, segment in enumerate(segments)
+        if index and any(segment.offset)
+    }
+    used = [column for own in columns.values() for column in own]
+    if not used or values[:, used].any():
+        return list(segments), []
+    kept = [
+        segment._replace(turns=tuple(turn for turn in segment.turns if turn.is_rotation))
+        if columns.get(index)
+        else segment
+        for index, segment in enumerate(segments)
+    ]
+    return kept, ["positions of joints are all zero in the file: their offsets are used"]
+
+
 def _channels(words: _Words, first_column: int) -> tuple[Channel, ...]:
     words.keyword("CHANNELS")
     line = words.line

@@ -40,7 +40,7 @@ from torchcss.body.files.bvh import (
     skeleton_span,
     stands_along_z,
 )
-from torchcss.body.files.bvh_parser import Segment, parse_bvh
+from torchcss.body.files.bvh_parser import Segment, parse_bvh, without_empty_positions
 from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
 from torchcss.files import StrPath, shortened
@@ -111,7 +111,7 @@ def read_motion_capture(
             f"{path}: a skeleton without motion; it is a body (load_body), not a motion"
         )
     if frame_rate is not None:
-        rate, report = frame_rate, []
+        rate, report = frame_rate, [line for line in report if "rate assumed" not in line]
     report = [f"{len(values)} frames, {rate:g} per second", *report]
     with np.errstate(all="ignore"):  # whatever overflows is found below
         rest, joints = rest_positions(segments), _positions(segments, values)
@@ -138,7 +138,9 @@ def _parse(
     """What either format says: segments, their numbers, rate, metres per unit, and notes."""
     suffix = path.suffix.lower()
     if suffix == ".bvh":
-        return *parse_bvh(path), None, []
+        segments, values, rate = parse_bvh(path)
+        segments, empty = without_empty_positions(segments, values)
+        return segments, values, rate, None, empty
     if suffix != ".amc":
         raise MotionCaptureError(
             f"{path}: expected a .bvh file, or an .amc file with its .asf, found {suffix!r}"
