@@ -489,6 +489,46 @@ def test_colmaps_pictures_that_are_none(tmp_path: Path) -> None:
         load_camera(tmp_path / "cameras.bin")
 
 
+QUALISYS = """<?xml version="1.0"?><calibration><cameras>
+<camera active="1" serial="21000" model="Miqus M3" viewrotation="0">{parts}</camera>
+<camera active="1" serial="26580" model="Miqus Video" viewrotation="{turned}">{parts}</camera>
+</cameras></calibration>"""
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_qualisys(tmp_path: Path, shown: bool) -> None:
+    """64ths of pixels, millimetres, and a camera whose y is up: it looks along its own -z."""
+    look = np.diag([1, -1, -1]) @ TURN
+    centre = np.array([1200.0, -300.0, 1500.0])
+    turn = " ".join(f'r{i + 1}{j + 1}="{look[i, j]}"' for i in range(3) for j in range(3))
+    x, y, z = centre
+    left, top = (16, 8) if shown else (0, 0)
+    k1, k2, p1, p2, k3 = LENS
+    parts = f"""<transform x="{x}" y="{y}" z="{z}" {turn}/>
+    <intrinsic focallength="9" sensorMinU="0" sensorMaxU="{640 * 64 - 1}" sensorMinV="0"
+    sensorMaxV="{480 * 64 - 1}" focalLengthU="{64 * FX}" focalLengthV="{64 * FY}"
+    centerPointU="{64 * (CX + left)}" centerPointV="{64 * (CY + top)}" skew="0"
+    radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"
+    tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>"""
+    if shown:
+        parts += f'<fov_video left="{left}" top="{top}" right="{left + 639}" bottom="{top + 479}"/>'
+    path = tmp_path / "a.qca.txt"
+    path.write_text(QUALISYS.format(parts=parts, turned=0))
+    assert list(read_entries(path)) == ["26580"]  # the other one sees markers alone
+    loaded = load_camera(path)
+    np.testing.assert_allclose(loaded.camera.K, K)
+    np.testing.assert_allclose(loaded.camera.distortion, LENS)
+    assert loaded.camera.image_size_wh == SIZE
+    assert loaded.metric
+    np.testing.assert_allclose(loaded.camera.R_camera_world, TURN, atol=1e-12)
+    np.testing.assert_allclose(loaded.camera.centre_world, 0.001 * centre)
+    path.write_text(QUALISYS.format(parts=parts, turned=90))
+    assert "viewrotation '90'" in str(load_camera(path).units_note)
+    path.write_text(QUALISYS.format(parts=parts.replace("r33", "r34"), turned=0))
+    with pytest.raises(CameraError, match="camera '26580': not Qualisys'"):
+        load_camera(path)
+
+
 def test_numbers_that_yaml_takes_for_text(tmp_path: Path) -> None:
     """Other writers leave out the point, or what is before it."""
     text = yaml_matrix("camera_matrix", K, 3)

@@ -11,6 +11,7 @@
 | Kalibr | YAML: `cam0` with `intrinsics` |
 | COLMAP | `cameras.txt` or `cameras.bin`, or their folder; `images` beside say places |
 | KITTI, ROS | `.txt`: numbers below or behind what they are |
+| Qualisys | `.qca.txt` |
 | MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
 | arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone; of several cameras |
 
@@ -160,7 +161,7 @@ _OTHERS = {
     ".sfm .abc": "Meshroom's; give K, image_size_wh and distortion in a cameras.json",
     ".pickle .pkl": "a pickle, from which code may run: not read; save K, dist, R and t with "
     "numpy.savez",
-    ".qca.txt .xcp": "the calibration of a motion capture system; save it as Pose2Sim's Calib.toml",
+    ".xcp": "the calibration of a motion capture system; save it as Pose2Sim's Calib.toml",
 }
 """Files of other kinds by how their names end, and what to do."""
 
@@ -194,6 +195,8 @@ def read_entries(path: Path) -> dict[str, Entry]:
     for suffixes, what in _OTHERS.items():
         if path.name.lower().endswith(tuple(suffixes.split())) and path.is_file():
             raise CameraError(f"{path}: {what}")
+    if path.name.lower().endswith(".qca.txt"):
+        return _read_qualisys(path)
     with naming(path, CameraError):
         return _READERS.get(path.suffix.lower(), _read_json)(path)
 
@@ -862,6 +865,58 @@ def _from_the_middle(found: Mapping[str, Any]) -> dict[str, Any]:
         K = [[f + b1, b2, cx + 0.5 * (width - 1)], [0, f, cy + 0.5 * (height - 1)], [0, 0, 1]]
     return {"K": K, "dist": [k1, k2, p1, p2, k3, k4], "image_size_wh": [width, height],
             "projection": found.get("projection")}  # fmt: skip
+
+
+def _read_qualisys(path: Path) -> dict[str, Entry]:
+    """Cameras of QTM by serial number, of its video cameras if it has some.
+
+    It counts 64ths of pixels of the whole sensor and millimetres, and a camera's y is up, its z
+    backwards (as Pose2Sim converts it). The coefficients are not in 64ths.
+    """
+    cameras = parse_xml(path, "Qualisys' XML", CameraError).findall("cameras/camera")
+    films = [each for each in cameras if "video" in each.get("model", "").lower()]
+    entries: dict[str, Entry] = {}
+    for camera in films or cameras:
+        name = camera.get("serial", str(len(entries)))
+        with refusing(CameraError, f"{path}: camera {name!r}: not Qualisys'"):
+            parts = {part.tag: part.attrib for part in camera}
+            lens, place, shown = parts["intrinsic"], parts["transform"], parts.get("fov_video")
+            if shown is None:
+                left = top = 0.0
+                size = [(float(lens[f"sensorMax{axis}"]) + 1) / 64 for axis in "UV"]
+            else:
+                left, top, right, bottom = (
+                    float(shown[side]) for side in names_in("left top right bottom")
+                )
+                size = [right - left + 1, bottom - top + 1]
+            fx, fy, cx, cy = (
+                float(lens[f"{word}{axis}"]) / 64
+                for word in ("focalLength", "centerPoint")
+                for axis in "UV"
+            )
+            words = names_in("radialDistortion1 radialDistortion2 tangentalDistortion1 "
+                             "tangentalDistortion2 radialDistortion3")  # fmt: skip
+            R = np.array([float(place[f"r{i}{j}"]) for i in "123" for j in "123"]).reshape(3, 3)
+            R = np.diag([1.0, -1.0, -1.0]) @ R
+            t = -R @ [float(place[axis]) for axis in "xyz"]
+            turned = camera.get("viewrotation", "0")
+            entries[name] = Entry(
+                [fx, fy, cx - left, cy - top],
+                size,
+                [float(lens.get(word, 0)) for word in words],
+                R.tolist(),
+                t.tolist(),
+                "mm",
+                note=None
+                if float(turned) == 0
+                else f"its pictures are shown turned (viewrotation {shortened(turned)}), its "
+                "numbers are those of the pictures as recorded: track them as recorded",
+            )
+    if not entries:
+        raise CameraError(
+            f"{path}: the calibration of a motion capture system; save it as Pose2Sim's Calib.toml"
+        )
+    return entries
 
 
 def _read_arrays(path: Path) -> dict[str, Entry]:
