@@ -92,6 +92,13 @@ def test_numbers_in_other_units_are_told(tmp_path: Path) -> None:
     )
 
 
+def test_angles_in_degrees_are_told(tmp_path: Path) -> None:
+    for angle, is_told in ((1.5708, False), (90, True)):
+        text = joint("hip", "base", "thigh").replace("0 0 0.3", f'0 0 0.3" rpy="{angle} 0 0')
+        body = load_body(urdf(tmp_path, text))
+        assert any("turn more than once around, ['hip']" in note for note in body.notes) == is_told
+
+
 def test_prefixes_that_nobody_declares(tmp_path: Path) -> None:
     path = urdf(
         tmp_path,

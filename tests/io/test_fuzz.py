@@ -11,6 +11,7 @@ import json
 import pickle
 import re
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ from torchcss.errors import TorchcssError, TrackFileError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.calibrations import read_entries
-from torchcss.io.cameras import read_camera
+from torchcss.io.cameras import load_lens, read_camera, read_cameras
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.one_image import read_joints
@@ -240,6 +241,11 @@ READERS = (
     Reader("several.npz", lambda path: read_camera(path, "1")),
     Reader("named.json", lambda path: read_camera(path, "b")),
     Reader("matrices/0.txt", beside(read_entries)),
+    Reader("colmap/images.txt", beside(read_cameras)),
+    Reader("colmap_bin/images.bin", beside(read_cameras)),
+    Reader("transforms.json", read_cameras),
+    Reader("a.qca.txt", read_camera),
+    Reader("fisheye.toml", load_lens),
     Reader("camera.mat", read_camera),
     Reader("motion.bvh", read_motion_capture),
     Reader("motion.amc", read_motion_capture),
@@ -367,6 +373,31 @@ def write_calibrations(folder: Path) -> None:
     np.savez(folder / "several.npz", K=np.array([K, K]), dist=np.zeros((2, 5)), image_size=size)
     (folder / "named.json").write_text(
         json.dumps({"a": P.tolist(), "b": P.tolist(), "image_size": SIZE})
+    )
+    (folder / "colmap").mkdir()
+    (folder / "colmap" / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    (folder / "colmap" / "images.txt").write_text("# units: m\n3 1 0 0 0 1 2 3 1 a.jpg\n1 2 -1\n")
+    (folder / "colmap_bin").mkdir()
+    camera = struct.pack("<QiiQQ4d", 1, 1, 1, 64, 48, 60, 60, 32, 24)
+    (folder / "colmap_bin" / "cameras.bin").write_bytes(camera)
+    image = struct.pack("<QI7dI", 1, 3, 1, 0, 0, 0, 1, 2, 3, 1) + b"a.jpg\0"
+    image += struct.pack("<Q2dq", 1, 1.0, 2.0, -1)
+    (folder / "colmap_bin" / "images.bin").write_bytes(image)
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    numbers = {"fl_x": 60, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
+    (folder / "transforms.json").write_text(json.dumps({**numbers, "frames": [frame]}))
+    turn = " ".join(f'r{i}{j}="{int(i == j)}"' for i in range(1, 4) for j in range(1, 4))
+    (folder / "a.qca.txt").write_text(
+        '<calibration><cameras><camera serial="7" model="Miqus Video">'
+        f'<transform x="1" y="2" z="3" {turn}/>'
+        '<intrinsic sensorMaxU="4095" sensorMaxV="3071" focalLengthU="3840" '
+        'focalLengthV="3840" centerPointU="2048" centerPointV="1536"/></camera></cameras>'
+        "</calibration>"
+    )
+    (folder / "fisheye.toml").write_text(
+        f"[cam_0]\nname = 'a'\nsize = [64, 48]\nmatrix = {K}\nfisheye = true\n"
+        "distortions = [0.05, -0.01, 0.003, -0.0004]\nrotation = [0.0, 0.0, 0.0]\n"
+        "translation = [0.0, 0.0, 2.0]\n"
     )
     (folder / "matrices").mkdir()
     np.savetxt(folder / "matrices" / "0.txt", P)

@@ -682,7 +682,7 @@ def _with_places(path: Path, entries: dict[str, Entry], unit: Any) -> dict[str, 
     A camera that took all its pictures from one place stands there.
     """
     beside = [path.with_name(f"images{suffix}") for suffix in (path.suffix, ".bin", ".txt")]
-    images = next((each for each in beside if each.is_file()), None)
+    images = next((each for each in beside if each.exists()), None)
     if images is None:
         return entries
     if images.suffix == ".bin":

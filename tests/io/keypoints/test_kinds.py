@@ -1725,3 +1725,26 @@ def test_tables_that_pandas_keeps_in_hdf5(tmp_path: Path, form: str) -> None:
                 group[f"axis0_label{number}"] = np.array([level.index(each) for each in own])
             group["block0_values"] = values
     check(read(tmp_path / "a.h5"))
+
+
+@pytest.mark.parametrize("word", ["body_list", "objects"])
+def test_bodies_of_zed(tmp_path: Path, word: str) -> None:
+    """Pixels beside points in space, confidences in percent, times in nanoseconds."""
+    frames = []
+    for t in T:
+        joints = person(t, OPENPOSE)
+        body = {"id": 3, "keypoint": [[0.1, 0.2, 2.0]] * 18, "keypoint_2d": joints[:, :2].tolist(),
+                "keypoint_confidence": (100 * joints[:, 2]).tolist()}  # fmt: skip
+        frames.append({"ts": 1_700_000_000_000_000_000 + t * 40_000_000, word: [body]})
+    found = read(write(tmp_path / "a.json", frames), frame_rate=25.0)
+    check(found)
+    assert float(found.confidence[0, 0]) == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("layout", ["LSP-14", "COCO-18", "BODY_25"])
+def test_yolo_labels_of_other_joints(tmp_path: Path, layout: str) -> None:
+    for t, rows in enumerate(of_layout(layout)):
+        fractions = rows / (*SIZE, 1)
+        text = " ".join(map(str, [0, 0.5, 0.5, 0.2, 0.5, *fractions.ravel()]))
+        write(tmp_path / "labels" / f"clip_{t + 1}.txt", text)
+    check(read(tmp_path / "labels"), names=LIMBS[:-1])

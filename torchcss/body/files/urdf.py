@@ -94,6 +94,11 @@ def read_urdf(
                 "free"
             )
     joints = _tree(root, elements)
+    turned = [name for name, element in elements.items() if _turns_more_than_once(name, element)]
+    if turned:
+        notes.append(
+            f"joints whose rpy turn more than once around, {shortened(turned)}: they are radians"
+        )
     if wide := [each.name for each in joints if _MOST_TURN < each.upper - each.lower < math.inf]:
         notes.append(
             f"joints whose limits are far apart, {shortened(wide)}: they are radians and metres"
@@ -214,6 +219,13 @@ def _joint(element: ElementTree.Element) -> JointSpecification:
             "numbers and a multiplier that is not zero"
         )
     return replace(joint, mimic=(mimic.get("joint", ""), multiplier, offset))
+
+
+def _turns_more_than_once(name: str, element: ElementTree.Element) -> bool:
+    """Whether a joint's angles are more than radians are."""
+    origin = element.find("origin")
+    text = "0 0 0" if origin is None else origin.get("rpy", "0 0 0")
+    return max(map(abs, _numbers(f"joint {name!r}", "rpy", text, 3))) > 2 * math.pi + 0.01
 
 
 def _solids(robot: ElementTree.Element) -> tuple[PartSpecification, ...]:

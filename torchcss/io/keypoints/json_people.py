@@ -39,7 +39,8 @@ from torchcss.io.keypoints.words import (
 from torchcss.joint_names import names_in
 
 PEOPLE = names_in(
-    "people bodies instances instanceinfo predictions annots poses persons players detections body"
+    "people bodies instances instanceinfo predictions annots poses persons players detections body "
+    "bodylist objects"
 )
 JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "

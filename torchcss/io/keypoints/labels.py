@@ -14,7 +14,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import read_text, shortened
 from torchcss.io.keypoints.frames import files_of, plain_name
-from torchcss.io.keypoints.people import Frames, People, Person, Size, screened
+from torchcss.io.keypoints.people import LAYOUT_SIZES, Frames, People, Person, Size, screened
 
 _BOX = 5
 _COUNTS = (17, 26, 133)
@@ -44,9 +44,11 @@ def _person(where: str, words: list[str], image_size_wh: Size) -> Person:
     except ValueError:
         values = np.zeros(0)
     count = len(values) - _BOX
-    # Behind the joints may stand the box's confidence and the track.
-    sizes = [(n, size, more) for size in (3, 2) for more in (0, 1, 2) for n in _COUNTS
-             if n * size + more == count]  # fmt: skip
+    # Behind the joints may stand the box's confidence and the track; other data sets have other
+    # numbers of joints, whose labels have neither.
+    sizes = [(n, 3, 0) for n in LAYOUT_SIZES if 3 * n == count]
+    sizes += [(n, size, more) for size in (3, 2) for more in (0, 1, 2) for n in _COUNTS
+              if n * size + more == count]  # fmt: skip
     if not sizes:
         raise KeypointError(
             f"{where}: expected YOLO's pose labels, class, box and x, y, confidence of a known "

@@ -28,7 +28,7 @@ TIMES: dict[str, float | None] = {
     **dict.fromkeys(("timestampus", "timeus"), 1e-6),
     **dict.fromkeys(("timestampns", "timens", "nanoseconds"), 1e-9),
     **dict.fromkeys(("timestamps", "times", "timesec", "timeseconds", "seconds"), 1.0),
-    **dict.fromkeys(("timestamp", "time", "timecode", "t"), None),
+    **dict.fromkeys(("timestamp", "time", "timecode", "t", "ts"), None),
 }
 """A time, and its unit in seconds, where the word says it."""
 
