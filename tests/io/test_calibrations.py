@@ -621,6 +621,18 @@ FISHEYE_FILES: dict[str, tuple[str, Any]] = {
         {"camera_model": "OPENCV_FISHEYE", "fl_x": FX, "fl_y": FY, "cx": CX + 0.5,
          "cy": CY + 0.5, "w": 640, "h": 480, **K1_TO_K4},
     ),
+    "RealSense T265": (
+        "a.json",
+        {"fx": FX, "fy": FY, "ppx": CX, "ppy": CY, "width": 640, "height": 480,
+         "model": "distortion.kannala_brandt4", "coeffs": [*FISHEYE, 0.0]},
+    ),
+    "Metashape": (
+        "a.xml",
+        "<calibration><projection>fisheye</projection><width>640</width><height>480</height>"
+        f"<f>{FY}</f><b1>{FX - FY}</b1><cx>{CX - 319.5}</cx><cy>{CY - 239.5}</cy>"
+        + "".join(f"<{word}>{value}</{word}>" for word, value in K1_TO_K4.items())
+        + "</calibration>",
+    ),
     "ORB-SLAM": (
         "a.yaml",
         "%YAML:1.0\nCamera.type: 'KannalaBrandt8'\n" + "".join(
@@ -666,6 +678,17 @@ def test_lenses_of_many_coefficients(tmp_path: Path, count: int) -> None:
     path.write_text((OPENCV + text).replace(f"{given[-1]}]", ".nan]"))
     with pytest.raises(CameraError, match="distortion"):
         load_lens(path)
+
+
+@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE"])
+def test_a_camera_of_another_model_beside_one_that_is_read(tmp_path: Path, model: str) -> None:
+    numbers = " ".join(["1"] * (5 if model == "FOV" else 12))
+    (tmp_path / "cameras.txt").write_text(
+        f"1 {model} 640 480 {numbers}\n2 PINHOLE 640 480 {FX} {FY} {CX + 0.5} {CY + 0.5}\n"
+    )
+    check(tmp_path, [0.0] * 5, name="2")
+    with pytest.raises(CameraError, match="this model of a fisheye lens is not supported"):
+        load_camera(tmp_path, "1")
 
 
 @pytest.mark.parametrize(

@@ -634,6 +634,9 @@ def _colmap_entries(rows: Mapping[str, Sequence[str]]) -> dict[str, Entry]:
         except ValueError:
             size = values = []
         names = _COLMAP.get(model, "").split()
+        if not names and ("FISHEYE" in model or model == "FOV"):  # the other cameras are read
+            entries[row[0]] = Entry([], size, fisheye=True)
+            continue
         if not names or len(values) != len(names) or len(size) != 2:
             raise CameraError(
                 f"{where}: expected COLMAP's camera, CAMERA_ID MODEL WIDTH HEIGHT and the "
@@ -863,7 +866,9 @@ def _from_the_middle(found: Mapping[str, Any]) -> dict[str, Any]:
     f, cx, cy, b1, b2, k1, k2, k3, k4, p2, p1, width, height = (found.get(w) or 0 for w in words)
     with refusing(CameraError, "not Metashape's calibration"):
         K = [[f + b1, b2, cx + 0.5 * (width - 1)], [0, f, cy + 0.5 * (height - 1)], [0, 0, 1]]
-    return {"K": K, "dist": [k1, k2, p1, p2, k3, k4], "image_size_wh": [width, height],
+    is_fisheye = _FISHEYE.search(str(found.get("projection"))) and not (p1 or p2)
+    lens = [k1, k2, k3, k4] if is_fisheye else [k1, k2, p1, p2, k3, k4]
+    return {"K": K, "dist": lens, "image_size_wh": [width, height],
             "projection": found.get("projection")}  # fmt: skip
 
 

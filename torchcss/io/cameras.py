@@ -135,10 +135,11 @@ def load_lens(
     is_fisheye = entry.fisheye == "equidistant"
     most = MOST_COEFFICIENTS[is_fisheye]
     coefficients = numbers.distortion
-    if len(coefficients) > most or not np.isfinite(coefficients).all():
+    if coefficients[most:].any() or not np.isfinite(coefficients).all():
         raise unexpected(
             CameraError, f"{where}: distortion", f"at most {most} numbers", coefficients.tolist()
         )
+    coefficients = coefficients[:most]
     numbers = numbers._replace(distortion=np.zeros(4))
     _loaded(name, entry, numbers, path)  # which checks K
     lens = Lens(numbers.K, tuple(coefficients.tolist()), is_fisheye)
