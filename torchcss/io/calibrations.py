@@ -844,6 +844,11 @@ def _listed(value: Any) -> Any:
 def _read_xml(path: Path) -> dict[str, Entry]:
     """What OpenCV and OpenPose store as XML."""
     root = parse_xml(path, "OpenCV's XML", CameraError)
+    if root.tag == "document" and root.find("chunk") is not None:
+        raise CameraError(
+            f"{path}: Metashape's cameras of a project; save each camera's calibration as "
+            "Agisoft's XML (Tools, Camera Calibration)"
+        )
     found: dict[str, Any] = {}
     for element in root:
         parts = {part.tag: (part.text or "").split() for part in element}

@@ -1748,3 +1748,9 @@ def test_yolo_labels_of_other_joints(tmp_path: Path, layout: str) -> None:
         text = " ".join(map(str, [0, 0.5, 0.5, 0.2, 0.5, *fractions.ravel()]))
         write(tmp_path / "labels" / f"clip_{t + 1}.txt", text)
     check(read(tmp_path / "labels"), names=LIMBS[:-1])
+
+
+def test_boxes_of_objects_beside_keypoints(tmp_path: Path) -> None:
+    frames = [{"frame": t, "objects": [{"bbox": [0, 0, 9, 9]}], "keypoints": person(t).tolist()}
+              for t in T]  # fmt: skip
+    check(read(write(tmp_path / "a.json", frames)))

@@ -39,9 +39,11 @@ from torchcss.io.keypoints.words import (
 from torchcss.joint_names import names_in
 
 PEOPLE = names_in(
-    "people bodies instances instanceinfo predictions annots poses persons players detections body "
-    "bodylist objects"
+    "people bodies instances instanceinfo predictions annots poses persons players detections body"
 )
+_OBJECTS = names_in("bodylist objects")
+"""The same, where no joints stand beside it: other programs' objects are boxes."""
+
 JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
     "pose kps kpts keypointsxy keypoints2d keypoint2d joints2d"
@@ -83,6 +85,8 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
                 return people_of(f"{where}: {key}", scored(inner, value))
             return one_person(f"{where}: {key}", inner, value)
+        if (key := key_of(value, _OBJECTS)) is not None and isinstance(value[key], list):
+            return people_of(f"{where}: {key}", value[key])
         named = {key: each for key, each in value.items() if is_joints([each])}
         rest = [each for key, each in value.items() if key not in named]
         if named and not any(isinstance(each, (list, dict)) for each in rest):
