@@ -37,7 +37,6 @@ def person_and_cost(**options) -> tuple[RandomPerson, TrackingCost]:
 
 def moved(cost: TrackingCost, mark: int, pixels: tuple[float, float]) -> TrackingCost:
     """The same with one mark elsewhere."""
-    assert cost.keypoints is not None
     places = cost.keypoints.positions.clone()
     places[mark] += places.new_tensor(pixels)
     return cost.with_keypoints(cost.keypoints._replace(positions=places))
@@ -47,7 +46,6 @@ def test_price_is_that_of_a_place_anywhere_in_the_image():
     _, cost = person_and_cost()
     price = price_of_leaving_out(cost)
     plain = math.log(0.95 / 0.05 * 1920 * 1080 / (2 * math.pi * 4))
-    assert cost.keypoints is not None
     at = dict(zip(cost.keypoints.names, price.tolist(), strict=True))
     assert at["l_wrist"] == pytest.approx(plain)
     assert at["l_hip"] == pytest.approx(plain - math.log(4))
@@ -69,7 +67,6 @@ def test_a_mark_that_is_elsewhere_is_left_out_and_no_other(name: str):
 
 def test_where_very_many_marks_do_not_fit_none_is_left_out(generator: torch.Generator):
     someone, cost = person_and_cost()
-    assert cost.keypoints is not None
     size = torch.tensor(cost.camera.image_size_wh)
     anywhere = size * torch.rand(14, 2, generator=generator).double()
     scattered = cost.with_keypoints(cost.keypoints._replace(positions=anywhere))

@@ -9,6 +9,7 @@ from html import unescape
 from pathlib import Path
 
 import pytest
+import torch
 from made_clip import grey_film
 from made_tracks import make_track
 
@@ -97,3 +98,13 @@ def facts_of(folder: Path, summary: dict) -> dict[str, str]:
     files = replace(camera.files, keypoints=Path("joints.npz"))
     run = replace(run, track=run.track._replace(cameras=(camera._replace(files=files),)))
     return dict(report._facts(run))
+
+
+def test_the_angle_is_that_of_the_longer_side(folder: Path) -> None:
+    run = Run.open(folder)
+    K = torch.tensor([[300.0, 0, 299.5], [0, 400, 399.5], [0, 0, 1]], dtype=torch.float64)
+    (camera,) = run.cameras
+    upright = camera._replace(camera=Camera(K, (600, 800), name="upright"))
+    run = replace(run, track=run.track._replace(cameras=(upright,)))
+    page = report.write_report_page(run).read_text()
+    assert "600 x 800 pixels, focal length 300 pixels (90 degrees along the longer side)" in page

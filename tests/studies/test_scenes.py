@@ -182,9 +182,7 @@ def test_a_sequences_states_are_the_truth(tmp_path: Path) -> None:
     assert one.name == f"{tmp_path.name}, frame 2"
     torch.testing.assert_close(one.truth, sequence.truth.states[2].to(one.truth))
     assert float(one.mode.cost) <= float(one.cost.value(one.truth[None])[0])
-    contour = one.cost.choice.find(ContourTerm)
-    assert contour is not None
-    assert contour.assignment == "sum"
+    assert one.cost.choice.find(ContourTerm).assignment == "sum"
     with pytest.raises(ConfigurationError, match="frame before it"):
         next(sequence_scenes(sequence, [0], settings=settings))
     with pytest.raises(ConfigurationError, match=r"truth\.npz"):

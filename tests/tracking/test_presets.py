@@ -175,8 +175,6 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
         expected.discard("interpenetration")
     assert {term.name for term in choice.terms} == expected
     contour, flow = choice.find(ContourTerm), choice.find(FlowTerm)
-    assert contour is not None
-    assert flow is not None
     for term in (contour, flow):
         assert (term.fitted_level, term.weight) == (1.0, settings.contour_weight)
         assert (term.occlusion_factor > 1) == name.startswith("ijrr_")
@@ -185,7 +183,6 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
     assert contour.strength == name.startswith("rr_")
     assert contour.foreground == name.startswith("ijrr_")
     stabiliser = choice.find(Stabiliser)
-    assert stabiliser is not None
     assert stabiliser.hidden_only
     assert (stabiliser.nu == 9.0) == row.robust
     extractor = make_extractor(settings)
@@ -263,9 +260,7 @@ def test_both_terms_are_divided_by_one_number_of_nodes(name):
     view = cost.views[0]
     count = sum(view.tables.of(kind).num_nodes for kind in (ContourPredictor, InteriorNodes))
     for kind in (ContourTerm, FlowTerm):
-        term = cost.choice.find(kind)
-        assert term is not None
-        bound = cost.bound[term, view]
+        bound = cost.bound[cost.choice.find(kind), view]
         assert isinstance(bound, OnPoints)
         assert bound.scale == pytest.approx(Settings().contour_weight / count)
 
@@ -303,15 +298,12 @@ def test_either_potential_of_the_papers_can_be_chosen():
     for name, kind in (("lorentzian", Lorentzian), ("leclerc", Leclerc)):
         choice = make_choice(Settings(preset="rr_multiple_hypothesis", potential=name), 2.0)
         for term in (choice.find(ContourTerm), choice.find(FlowTerm)):
-            assert term is not None
             assert term.potential_kind is kind
             # Nothing that is matched costs more than what is hidden or faces away.
             worst = float(term.potential(torch.tensor(1e9)).rho) / 2
             assert kind is Lorentzian or worst < term.occlusion_factor * term.fitted_level
     ours = make_choice(Settings(potential="leclerc"), 2.0)
     contour, joints = ours.find(ContourTerm), ours.find(JointTerm)
-    assert contour is not None
-    assert joints is not None
     assert joints.potential_kind is Lorentzian
     hidden = contour.occlusion_factor * contour.fitted_level
     assert contour.fitted_level < hidden < contour.unmatched < 0.5
@@ -348,8 +340,6 @@ def test_css_has_what_was_measured_to_help():
     assert tracker.dynamics == ConstantVelocity(deviation=0.1, persistence=0.8)
     assert (tracker.separation, tracker.forgetting) == (0.12, 1.0)
     contour, flow = (make_choice(plain, 2.0).find(kind) for kind in (ContourTerm, FlowTerm))
-    assert contour is not None
-    assert flow is not None
     assert contour.fitted_level == pytest.approx(0.983, abs=1e-3)
     assert (flow.fitted_level, flow.occlusion_factor) == (0.3, 1.1)
 

@@ -62,7 +62,7 @@ class WorkClaim:
 
     Attributes:
         name: What is claimed.
-        generation: The how manyth claim to it this is.
+        generation: Number of this claim to it, from 1 on.
     """
 
     def __init__(self, claims: Claims, name: str, generation: int) -> None:

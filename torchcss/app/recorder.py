@@ -111,7 +111,7 @@ class Recorder:
         sinks: What sees the frames besides; closed at the end of the run.
         on_first_frame: Writes what else belongs to the run, when its first frame is saved.
         checkpoint_every: Seconds of wall time between checkpoints.
-        begun: The run that is gone on with, which has a checkpoint; None: it starts.
+        begun: The run to go on with, which has a checkpoint; None: a new one starts.
         lock: The lock of the folder: nothing is written when another process has taken it over.
         num_done: Frames that were tracked before this run goes on.
     """

@@ -27,7 +27,7 @@ from torchcss.errors import check_shape
 
 
 class Held(NamedTuple):
-    """What a track holds and one camera does not show, and how little is known of it.
+    """How well size and focal length are known, which tracking holds and one camera does not show.
 
     Attributes:
         size: Standard deviation of the logarithm of the body's size.

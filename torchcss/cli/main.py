@@ -6,7 +6,7 @@
 | `torchcss init IMAGE` | fits a body to one picture with marked joints |
 | `torchcss detect VIDEO` | finds the keypoints of a video |
 | `torchcss track VIDEO` | tracks a body through a video |
-| `torchcss undistort VIDEO` | makes straight pictures of a fisheye lens's |
+| `torchcss undistort VIDEO` | makes straight pictures out of those of a fisheye lens |
 | `torchcss batch MANIFEST` | tracks many clips, by several processes |
 | `torchcss smooth TRACK` | makes one smooth trajectory of a track's modes |
 | `torchcss export TRACK` | writes a track for another program |

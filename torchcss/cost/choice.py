@@ -79,9 +79,9 @@ class CostChoice:
         """The further factor on a term."""
         return self.weights.get(name, 1.0)
 
-    def find(self, kind: type[_Term]) -> _Term | None:
-        """The term of a class, if it is among them."""
-        return next((term for term in self.terms if isinstance(term, kind)), None)
+    def find(self, kind: type[_Term]) -> _Term:
+        """The term of a class, which is among them."""
+        return next(term for term in self.terms if isinstance(term, kind))
 
     def having(self, *terms: Term) -> CostChoice:
         """The same with some terms in place of those of their names, or besides."""

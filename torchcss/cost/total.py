@@ -132,9 +132,11 @@ class TrackingCost:
         return self.views[0].camera
 
     @property
-    def keypoints(self) -> Keypoints | None:
-        """The keypoints of the first view."""
-        return self.views[0].keypoints
+    def keypoints(self) -> Keypoints:
+        """The keypoints of the first view, which has some."""
+        keypoints = self.views[0].keypoints
+        assert keypoints is not None
+        return keypoints
 
     def with_weights(self, weights: Mapping[str, float]) -> TrackingCost:
         """The same cost with further factors on named terms and priors (`CostChoice.weights`)."""

@@ -165,8 +165,6 @@ def initialise(
 def _misses(alone: TrackingCost, x: Vector) -> str | None:
     """A line where keypoints cost as much as if all of them erred `_POOR_FIT` times their noise."""
     joints, given = alone.choice.find(JointTerm), alone.keypoints
-    assert joints is not None
-    assert given is not None
     error = 2 * x.new_tensor(_POOR_FIT * joints.sigma).square()
     most = alone.choice.weight(joints.name) * joints.weight * 0.5 * joints.potential(error).rho
     if alone.terms(x[None])[joints.name] <= most * (given.confidence > 0).sum():
@@ -267,7 +265,6 @@ def _contour_cost(
     factor = _factor(view.camera, working)
     choice = options.joint_choice
     joints = choice.find(JointTerm)
-    assert joints is not None
     beside = (ContourTerm(weight=_BESIDE_COLOURS), RegionTerm())
     outlines = beside if options.colours else (ContourTerm(),)
     choice = choice.having(replace(joints, sigma=factor * joints.sigma))

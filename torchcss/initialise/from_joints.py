@@ -111,7 +111,6 @@ def _with_lengths_fitted(
 ) -> Initialisation:
     """Fit pose and lengths, leave outliers out, and refine the poses with the lengths held."""
     free, keypoints = cost.body, cost.keypoints
-    assert keypoints is not None
     fits, outliers = fits_and_outliers(cost, search=options.search, generator=generator)
     left_out = tuple(compress(keypoints.names, outliers.tolist()))
     if left_out:

@@ -164,7 +164,6 @@ def swapped_sides(cost: TrackingCost, x: Vector, generator: torch.Generator) -> 
         A line for the report, or none.
     """
     given = cost.keypoints
-    assert given is not None
     # Exchanged keypoints may have been left out as outliers, which has its price too.
     best = float(capped_cost(cost, x))
     if best < _SUSPICIOUS * int((given.confidence > 0).sum()) or not has_root(cost.body):

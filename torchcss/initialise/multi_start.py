@@ -58,7 +58,8 @@ _ON_PLACE = 0.01
 """Standard deviation of a joint's place after a flip, metres."""
 
 _SAME_ANGLE = 0.05
-"""Radians within which two flips of a limb are one: limits or the sight line closed the other."""
+"""Radians within which two flips of a limb count as one: a joint limit, or a line of sight that
+passes beside the limb's reach, left no other."""
 
 
 @frozen
@@ -170,9 +171,9 @@ def multi_start_fits(
         ((_WIDE, 12), (_MIDDLE, 12)) if search.anneal else (),
     )  # fmt: skip
     starts = [fits]
-    if cost.keypoints is not None and cost.keypoints.points is not None:
+    if (keypoints := cost.views[0].keypoints) is not None:
         turned = first[:: max(1, len(first) // _TURNS)]
-        starts.append(start_from_points(body, cost.camera, cost.keypoints, turned, bounds))
+        starts.append(start_from_points(body, cost.camera, keypoints, turned, bounds))
     if search.num_flips and (segments := Segments(body)).limbs:
         trunks = _distinct_trunks(cost, segments, torch.cat(starts), search.num_trunks)
         starts.append(flips(cost, segments, trunks, bounds, search.num_flips))
@@ -219,7 +220,6 @@ def descend_widened(
 def widened(cost: TrackingCost, factor: float) -> TrackingCost:
     """A cost with the scale of its keypoints multiplied by a factor."""
     joints = cost.choice.find(JointTerm)
-    assert joints is not None
     wide = replace(joints, sigma=factor * joints.sigma)
     return replace(cost, choice=cost.choice.having(wide))
 

@@ -35,7 +35,7 @@ BELIEF = 10.0
 _TURNS = 4
 
 _LEAST = 1e-6
-"""Curvature of what nothing tells."""
+"""Curvature along directions that neither keypoints nor priors determine."""
 
 
 class Noise(NamedTuple):
@@ -77,7 +77,6 @@ def noise_factor(cost: TrackingCost, x: Vector, search: StartSearch) -> float:
 def _left_over(cost: TrackingCost, x: Vectors, search: StartSearch) -> float:
     """The factor that follows from the errors of one fit."""
     joints, points = cost.choice.find(JointTerm), cost.body.pose(x[0]).joints
-    assert joints is not None
     squared, weight = [], []
     for view in cost.views:
         if view.keypoints is None:

@@ -124,8 +124,6 @@ def _put_back(
 def _matched(cost: TrackingCost) -> tuple[JointTerm, JointTargets]:
     """The joint term of a cost, and its keypoints matched to the body."""
     joints, keypoints = cost.choice.find(JointTerm), cost.keypoints
-    assert joints is not None
-    assert keypoints is not None
     return joints, match_joints(keypoints, cost.body.joint_names)
 
 
@@ -148,7 +146,6 @@ def capped_cost(cost: TrackingCost, x: Vectors) -> Numbers:
 def without(cost: TrackingCost, outliers: Bool[Tensor, "*b j"]) -> TrackingCost:
     """The same cost without some keypoints, which may be others for every item of a batch."""
     keypoints = cost.keypoints
-    assert keypoints is not None
     places = keypoints.positions.expand(*outliers.shape, 2)
     if outliers.dim() > 1:
         cost = replace(cost, parent=torch.arange(len(outliers), device=outliers.device))

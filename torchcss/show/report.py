@@ -235,7 +235,9 @@ def _cameras(run: Run) -> list[tuple[str, str]]:
     for camera, _, deviation in run.cameras:
         width, height = camera.image_size_wh
         focal = float(camera.K[0, 0])
-        angle = 2 * math.degrees(math.atan(0.5 * max(width, height) / focal))
+        side = int(height > width)
+        half = 0.5 * camera.image_size_wh[side] / float(camera.K[side, side])
+        angle = 2 * math.degrees(math.atan(half))
         doubt = f", known to {100 * deviation:.0f} %" if deviation else ""
         rows.append(
             (

@@ -232,7 +232,7 @@ class Viewer:
         body: The body, on any base.
         camera: The camera of the pictures; None: not known.
         up: Axis of the world that is up: x, y, z, -x, -y or -z.
-        events: Whether to leave room for losses.
+        events: Whether to list when the track was lost and found.
     """
 
     def __init__(

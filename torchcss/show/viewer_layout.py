@@ -49,7 +49,7 @@ def layout(
         joints: Where the body is in the first frame, metres, world frame.
         camera: The camera; None: not known, and pictures have no place in space.
         up: Axis of the world that is up.
-        events: Whether there is room for losses.
+        events: Whether to list when the track was lost and found.
     """
     blueprint = rerun().blueprint
     position, target, vertical = viewpoint(joints, camera, up)

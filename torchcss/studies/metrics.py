@@ -27,9 +27,8 @@ of covariance C, lies at the squared Mahalanobis distance d^2 = e^T C^-1 e, and 
 through it holds the probability P(chi^2_3 < d^2). If the covariance is right these probabilities
 are spread evenly over 0..1, so that `coverage` at 50 % is 50 %, and so on.
 
-By default: `track_errors`, which takes a whole track and returns all of it; the functions above it
-serve single poses and tests, those below it the comparison of trackers
-(`torchcss.studies.evaluation`).
+Call `track_errors` for all errors of a whole track. The functions above it are for single poses,
+those below it compare trackers frame by frame (`torchcss.studies.evaluation`).
 """
 
 from __future__ import annotations

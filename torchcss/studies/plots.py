@@ -4,7 +4,7 @@ Every function draws into the axes that it is given, so that a notebook lays out
 returns a `Figure` that belongs to nobody: no window opens and no global state changes, whatever
 matplotlib's backend. Colours are those that colour-blind viewers can tell apart.
 
-By default: `draw_slice` for a slice by terms; `error_curves`, then `failure_figure` for the runs of
+Call `draw_slice` for a slice by terms; `error_curves`, then `failure_figure` for the runs of
 `scripts/failure_modes.py`; `torchcss.show.style.save_figure` writes a figure.
 """
 

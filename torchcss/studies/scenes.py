@@ -1,12 +1,11 @@
 """Single frames with their cost, a true state and the mode nearest to it: to look at a cost.
 
-A tracker sees many states of a frame for a moment; here one frame stays at hand. Its cost is that
-of a tracker whose only mode in the frame before was a given state, and that knows colours from that
-frame alone. A `Scene` adds the truth and the
-mode that the optimiser reaches from there, whose covariance says along which lines the cost is
-worth a look (`torchcss.studies.slices`).
+The cost of such a frame is that of a tracker whose only mode in the frame before was a given state,
+and that knows colours from that frame alone. A `Scene` adds the truth and the mode that the
+optimiser reaches from there, whose covariance says along which lines the cost is worth a look
+(`torchcss.studies.slices`).
 
-By default: `arm_scenes` for frames of the rendered arm, whose truth is exact, `sequence_scenes` for
+Call `arm_scenes` for frames of the rendered arm, whose truth is exact, `sequence_scenes` for
 those of a sequence whose states are known, or `clip_scenes` for those of a recording with
 keypoints, where the fit to them that is nearest a 3D reference stands for the truth; then
 `Scene.lines` and `Scene.limits`.

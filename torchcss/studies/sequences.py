@@ -16,7 +16,7 @@ moves), `frame_rate` and `description`.
 A recording with several cameras has one video and one keypoint file per view: `cam01.mp4`,
 `keypoints2d_cam01.npz`, `mask_cam01.npz`.
 
-By default: `read_sequence(folder)`, or `read_sequence(folder, view="cam01")`; `read_reference` and
+Call `read_sequence(folder)`, or `read_sequence(folder, view="cam01")`; `read_reference` and
 `read_motion` read a reference or a motion alone.
 """
 

@@ -21,7 +21,7 @@ and at twice that: a steep slope halves, a discontinuity stays. For certainty th
 out most from the steps beside them are then bisected, always into the half with the larger
 difference; what is left of it when the step is thousands of times shorter is the discontinuity.
 
-By default: `joint_lines` or `eigen_lines`, then `sample_slice` on `Line.interval`, then
+Call `joint_lines` or `eigen_lines`, then `sample_slice` on `Line.interval`, then
 `Slice.report`.
 """
 

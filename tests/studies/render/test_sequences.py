@@ -271,6 +271,8 @@ def test_a_users_motion_is_filmed() -> None:
     states = body.rest.repeat(2, 1)
     states[1, body.state_index("r_elbow_flexion")] += 0.1
     motion = Motion(body, states, 30.0, "bend")
+    with pytest.raises(ConfigurationError, match="num_frames must be at least 1, got 0"):
+        shot_of_motion(motion, num_frames=0)
     frames = list(shot_of_motion(motion, style=STYLES["dark"], small=True).frames())
     assert len(frames) == 2
     assert float(frames[0].mask.double().mean()) > 0.01

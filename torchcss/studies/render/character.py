@@ -13,7 +13,7 @@ only be asked to find itself. A `Character` covers a body's parts with one close
 All of it is a function of the state alone: the same vertices in every frame, so that a point of the
 surface can be carried from frame to frame exactly. Colours belong to vertices too.
 
-By default: `Character(body, clothing, generator=...)`, then `character.pose(state)`.
+Call `Character(body, clothing, generator=...)`, then `character.pose(state)`.
 """
 
 from __future__ import annotations

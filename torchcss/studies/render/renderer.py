@@ -5,7 +5,7 @@ What is seen is found by `torchcss.vision.rasterise`. Light is ambient, plus a l
 halfway between the directions to the lamp and to the eye; it is evaluated per sample, on
 interpolated normals.
 
-By default call `render_meshes`: it draws meshes before a background with antialiased silhouettes.
+Call `render_meshes`: it draws meshes before a background with antialiased silhouettes.
 `random_texture` makes a cloth, `add_sensor_noise` the grain of a sensor. Scenes are in
 `torchcss.studies.render.scene`, exact labels in `torchcss.studies.render.mesh_truth`.
 

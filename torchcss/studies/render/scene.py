@@ -5,7 +5,7 @@ edges of `clutter_background`, or a dark curtain. The light of the first lamp is
 characters stand in it, from the backdrop and from the characters themselves, by the lamp's own
 picture of them (a shadow map).
 
-By default: `SceneRenderer(camera, place, style, generator=...)`, then `picture(meshes)` for every
+Call `SceneRenderer(camera, place, style, generator=...)`, then `picture(meshes)` for every
 frame. The scene does not move and is drawn once. `look_at` makes a camera.
 """
 
@@ -80,12 +80,12 @@ class Style:
     Attributes:
         scene: "clutter" or "dark".
         lamps: Spotlights, placed about the characters' middle: right, up, towards the camera,
-            metres. The first one casts shadows. Their ambient light and highlights are not used.
-        shadows: Whether it does.
+            metres. Their ambient light and highlights are not used.
+        shadows: Whether the first lamp casts shadows.
         fill: Strength of the light from the camera's side, without shadows.
         ambient: Light that is everywhere.
         specular: Strength of the highlights on the characters.
-        shininess: Their exponent.
+        shininess: Exponent of the highlights.
         pillar: Place of the bright pillar of the clutter, as a share of the picture's width.
         wall: Distance from the farthest point of the motion to the wall, metres.
     """

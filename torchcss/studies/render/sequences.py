@@ -430,8 +430,12 @@ def shot_of_motion(
         seed: Seed of the character, the scene and the noise.
         num_frames: Only the first frames.
         small: A quarter of the picture's width and height, for tests.
+
+    Raises:
+        ConfigurationError: If there is to be no frame.
     """
-    states = motion.states[:num_frames]
+    every = len(motion.states) if num_frames is None else num_frames
+    states = motion.states[: len(sample_times(every, motion.frame_rate))]
     points = motion.body.surface(motion.body.pose(states)).points
     camera = camera or camera_in_front(motion.body, states)
     if small:
