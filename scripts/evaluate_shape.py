@@ -26,7 +26,7 @@ from torchcss.initialise.fit import initialise
 from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import Initialisation
-from torchcss.io.video import VideoReader
+from torchcss.io.video import read_frame
 from torchcss.studies.evaluation import silhouette
 from torchcss.studies.metrics import mask_overlap, root_aligned_mpjpe_mm
 from torchcss.studies.sequences import RecordedSequence, read_sequence
@@ -83,9 +83,8 @@ def fit(
     sequence: RecordedSequence, index: int, config: Config, fitted: Mapping[str, Any]
 ) -> dict[str, float]:
     """Fit one frame and measure."""
-    (frame,) = VideoReader(sequence.video, start=index, stop=index + 1)
     found = initialise(
-        frame.image,
+        read_frame(sequence.video, index),
         sequence.keypoints.at(index),
         sequence.camera,
         config.body,

@@ -28,6 +28,7 @@ from torchcss.cli.options import SettingsOptions
 from torchcss.initialise.fit import initialise
 from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.view import CameraView
+from torchcss.studies.render.motions import sample_times
 from torchcss.studies.render.robots import film_robot, stand, trot
 from torchcss.studies.render.scene import look_at
 from torchcss.tracking.session import TrackingSession
@@ -116,7 +117,7 @@ def begin(config: Config, body: BodyModel, truth: Tensor) -> tuple[TrackingSessi
 def main(config: Config) -> dict[str, Any]:
     """Film, track, compare, print, write; return what is written."""
     body = load_quadruped(config.urdf)
-    truth = trot(body, torch.arange(config.frames, dtype=torch.float64) / RATE)
+    truth = trot(body, sample_times(config.frames, RATE))
     session, moments = begin(config, body, truth)
     best = torch.stack([each.joints_world[0].double().cpu() for each in session.track(moments)])
     links = 1000 * (best - body.pose(truth).joints).norm(dim=-1)

@@ -121,14 +121,13 @@ def compare(body: BodyModel, link: str, truth: Tensor, folder: Path) -> dict[str
     for name, chosen in (("best", torch.zeros_like(nearest)), ("nearest", nearest)):
         pick = (torch.arange(len(truth)), chosen)
         joints = (states[pick] - truth).abs()
-        turns = (body.tie[~body.tree.is_revolute] == 0).all(0)
         report[name] = {
             "joints_degrees": {
                 parameter: float(joints[:, i].mean().rad2deg())
                 for i, parameter in enumerate(body.state_names)
-                if turns[i]
+                if body.is_angle[i]
             },
-            "joint_degrees": float(joints[:, turns].mean().rad2deg()),
+            "joint_degrees": float(joints[:, body.is_angle].mean().rad2deg()),
             "end_effector_mm": 1000 * float(place[pick].mean()),
             "end_effector_degrees": float(turn[pick].mean().rad2deg()),
             "links_mm": 1000 * float(links[pick].mean()),

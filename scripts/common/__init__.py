@@ -13,6 +13,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -126,11 +127,14 @@ def made_by() -> dict[str, str]:
     """The command of this run, the version of the code, and the date."""
     script = Path(sys.argv[0]).resolve()
     name = script.relative_to(REPOSITORY) if script.is_relative_to(REPOSITORY) else script.name
-    described = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=REPOSITORY, capture_output=True, text=True
-    )
+    version = ""
+    with suppress(FileNotFoundError):  # no git here
+        version = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=REPOSITORY, capture_output=True,
+            text=True,
+        ).stdout.strip()  # fmt: skip
     return {
         "command": shlex.join(["python", str(name), *sys.argv[1:]]),
-        "version": described.stdout.strip() or "unknown",
+        "version": version or "unknown",
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
     }

@@ -57,6 +57,8 @@ def test_a_report_says_how_it_was_made(
     assert report["version"]
     assert datetime.date.fromisoformat(report["date"])
     assert report["table"]["rows"] == [["turn", 12.34], ["beam", None]]
+    monkeypatch.setenv("PATH", "")  # without git
+    assert common.made_by()["version"] == "unknown"
     table.print()
     assert capsys.readouterr().out == "Errors\nclip    mm\nturn  12.3\nbeam      \n"
     common.write_report(None, {})
