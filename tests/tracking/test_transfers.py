@@ -14,11 +14,11 @@ from torchcss.studies.render.sequences import SyntheticSequence
 OBSERVED = 12
 """Waits of the host while the features of a frame are made."""
 
-STEPPED = {"arm": 500, "person": 725}
+STEPPED = {"arm": 440, "person": 660}
 """Waits of the host in the step of a frame, in the mean over seeds, which differ by a third: 22 to
 38 evaluations of a few samples each."""
 
-EVALUATED = {"arm": 20, "person": 22}
+EVALUATED = {"arm": 18, "person": 20}
 """The same for every evaluation of the cost, which hardly differs."""
 
 _SEEDS = range(4)

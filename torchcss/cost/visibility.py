@@ -32,6 +32,7 @@ nodes.
 
 from __future__ import annotations
 
+from collections import deque
 from itertools import compress
 from typing import NamedTuple
 
@@ -326,7 +327,7 @@ def line_of_sight(
     """
     if others.numel() == 0:
         return eye.new_ones(rays.shape[:-1])
-    parts = tabulate_parts(shape.to(eye))
+    parts = _known_parts(shape, eye)
     views = _Views.of(rotation, eye, rays)
     if wanted is not None:  # what is not wanted ends before it begins
         wanted = wanted.reshape(views.length.shape)
@@ -388,6 +389,22 @@ class _Parts(NamedTuple):
     def shapes(self, part: Int[Tensor, " m"]) -> Superquadrics:
         """The shapes of some of them."""
         return Superquadrics._make(self.table.index_select(1, part).unbind(0))
+
+
+_KNOWN: deque[tuple[Tensor, _Parts]] = deque(maxlen=8)
+"""Parts that were looked past last, with the tensors of their shapes."""
+
+
+def _known_parts(shape: Float[Tensor, "parts 9"], like: Tensor) -> _Parts:
+    """What `tabulate_parts` says, which a body asks for in every evaluation."""
+    if torch.compiler.is_compiling() or shape.requires_grad:
+        return tabulate_parts(shape.to(like))
+    for known, parts in _KNOWN:
+        if known is shape and parts.table.dtype == like.dtype and parts.table.device == like.device:
+            return parts
+    parts = tabulate_parts(shape.to(like))
+    _KNOWN.append((shape, parts))
+    return parts
 
 
 def tabulate_parts(shape: Float[Tensor, "parts 9"]) -> _Parts:

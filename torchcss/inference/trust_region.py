@@ -403,14 +403,14 @@ class TrustRegionNewton:
         part = cost if len(items) == len(status) else cost.take(items)
         while len(items):
             pool, _ = self._step(part, pool, bounds, scale)
-            running = pool.status == Status.RUNNING
-            if bool(running.all()):
+            left = torch.nonzero(pool.status == Status.RUNNING)[:, 0]
+            places = len(items) - len(left)
+            if not places:
                 continue
             for into, field in zip(result.tensors, pool.tensors, strict=True):
                 into.index_copy_(0, items, field)
             # Waiting items take the places of finished ones; when none waits the pool shrinks.
-            places = int((~running).sum())
-            items, queue = torch.cat([items[running], queue[:places]]), queue[places:]
+            items, queue = torch.cat([items[left], queue[:places]]), queue[places:]
             pool, part = result.take(items), cost.take(items)
         return result
 
