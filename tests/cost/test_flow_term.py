@@ -420,3 +420,19 @@ def test_bad_input_is_refused(generator: torch.Generator) -> None:
         flow_targets(seen(*nodes(body, body.pose(x)), None, camera), camera, flow, outlier[:, 1:])
     with pytest.raises(ConfigurationError, match="sigma"):
         _ = FlowTerm(sigma=0.0).potential
+
+
+@pytest.mark.parametrize("miss", [0.0, 0.5, 0.8])
+def test_no_node_gains_by_facing_away_or_hiding(miss: float, generator: torch.Generator) -> None:
+    """A node costs less where it misses the flow by as much as fitted bodies do."""
+    camera, term = make_camera(), FlowTerm()
+    points, _ = random_nodes(3, generator=generator)
+    here = camera.project(points).uv
+    away = torch.randn(*here.shape, generator=generator, dtype=torch.float64)
+    uv = here + miss * away / away.norm(dim=-1, keepdim=True)
+    targets = FlowTargets(uv, torch.ones_like(uv[..., 0]))
+    one = torch.ones_like(targets.weight)
+    facing = SeenNodes(points, torch.zeros_like(points), one, one)
+    cost = term.value(facing, camera, targets)
+    assert (cost < term.value(facing._replace(exists=0 * one), camera, targets)).all()
+    assert (cost < term.value(facing._replace(visible=0 * one), camera, targets)).all()

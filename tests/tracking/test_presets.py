@@ -341,7 +341,7 @@ def test_css_has_what_was_measured_to_help():
     assert (tracker.separation, tracker.forgetting) == (0.12, 1.0)
     contour, flow = (make_choice(plain, 2.0).find(kind) for kind in (ContourTerm, FlowTerm))
     assert contour.fitted_level == pytest.approx(0.983, abs=1e-3)
-    assert (flow.fitted_level, flow.occlusion_factor) == (0.3, 1.1)
+    assert (flow.fitted_level, flow.occlusion_factor) == (0.7, 1.1)
 
 
 @pytest.mark.parametrize("preset", ["css", "ijrr_css"])

@@ -65,8 +65,9 @@ def test_carried_marks(size, monkeypatch, generator):
     torch.testing.assert_close(got, expected, rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize("steps", [7, 20])
 @pytest.mark.parametrize("size", SIZES)
-def test_solver(size, monkeypatch, generator):
+def test_solver(size, steps, monkeypatch, generator):
     height, width = size
 
     def random(*shape: int) -> torch.Tensor:
@@ -78,7 +79,7 @@ def test_solver(size, monkeypatch, generator):
     )
     right, down = 30 * random(1, height, width - 1), 30 * random(1, height - 1, width)
     energy = flow._Quadratic.of(constancy, weight, right, down)
-    got, expected = both(monkeypatch, lambda: flow._solve(start, energy, 20))
+    got, expected = both(monkeypatch, lambda: flow._solve(start, energy, steps))
     torch.testing.assert_close(got, expected, rtol=0, atol=1e-5)
 
 

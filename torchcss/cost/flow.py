@@ -128,9 +128,10 @@ class FlowTerm(Term):
         sigma: Scale of the difference between predicted and measured place, pixels. The flow is
             good to some tenths of a pixel; a wide scale lets a mode lag by as much in every frame.
         nu: Level of the outliers of one node (its unit only: the sum is normalised by N nu).
-        fitted_level: Cost of a node without measurement, `nu_bf`, as a share of nu: about the mean
-            error per node of a fitted model, 0.1 to 0.3 on the demo's sequence at its true states
-            and 0.6 to 0.8 on the beam clip.
+        fitted_level: Cost of a node without measurement, `nu_bf`, as a share of nu: the mean error
+            per node of a fitted model before a real camera, 0.6 to 0.8 on the beam clip (0.1 to 0.3
+            on the demo's sequence at its true states). Lower, and a limb gains by facing away from
+            a flow that it misses by half a pixel.
         occlusion_factor: k of `nu_occ = k nu_bf`, see `ContourTerm`.
         potential_kind: The potential rho.
         printed: Whether the term is eq. 9 alone; see the module.
@@ -144,7 +145,7 @@ class FlowTerm(Term):
     weight: float = 20.0
     sigma: float = 0.5
     nu: float = 1.0
-    fitted_level: float = 0.3
+    fitted_level: float = 0.7
     occlusion_factor: float = 1.1
     potential_kind: type = Lorentzian
     printed: bool = False
