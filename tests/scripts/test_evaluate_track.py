@@ -135,7 +135,7 @@ def test_joints_array_and_root_can_be_chosen(
         ({"joints": ("nose",)}, ConfigurationError, "no common joints"),
         ({"root": "nose"}, ConfigurationError, "--root"),
         ({"reference_array": "joint"}, TrackFileError, "--reference-array"),
-        ({"reference_array": "joint_names"}, TrackFileError, "expected shape"),
+        ({"reference_array": "joint_names"}, TrackFileError, "expected numbers of the shape"),
         ({"reference_array": "nothing"}, ShapeError, "all is NaN"),
         ({"reference_array": "short"}, ConfigurationError, "has 5 frames"),
         ({"reference": Path("absent.npz")}, TrackFileError, "no such file"),
