@@ -244,7 +244,7 @@ def test_bad_values(tmp_path: Path, more: dict[str, Any], words: str) -> None:
     with pytest.raises(CameraError, match=words) as caught:
         load_camera(path)
     message = str(caught.value)
-    assert message.count(str(path)) == 1
+    assert message.count(f"{path}: ") == 1  # a command may name it, too
     assert "one" in message
     assert "\n" not in message
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -102,9 +103,10 @@ def load_camera(
     where = f"{path}: camera {name!r}"
     numbers = _checked(entry, where)
     if (why := _unlike_a_pinhole(numbers.distortion, entry.fisheye)) is not None:
+        given, lens = (shlex.quote(str(each)) for each in (video or "VIDEO", path))
         raise CameraError(
-            f"{where}: {why} is not supported: torchcss undistort VIDEO --camera THIS --out FOLDER "
-            "makes straight pictures, and their camera and keypoints"
+            f"{where}: {why} is not supported: torchcss undistort {given} --camera {lens} "
+            "--out FOLDER makes straight pictures, and their camera and keypoints"
         )
     distortion = numbers.distortion[:5]
     return _loaded(name, entry, numbers._replace(distortion=distortion), path)
