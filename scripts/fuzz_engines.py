@@ -7,7 +7,8 @@ Of each case everything is drawn from its own seed: the body and the girth, tape
 roundness of its parts, one camera or two with distortion, edges, colours, flow, keypoints, the
 modes before, the terms and their potentials. Its states are ordinary, folded to their bounds, wild,
 behind the camera, across its plane, out of the picture and far away. Value, gradient and Hessian
-are compared in both precisions: values in nats, derivatives by the largest entry of the state's.
+are compared in both precisions: values in nats, derivatives by the largest entry of the state's;
+and values after a small motion with visibility and matches held.
 
 Left out are states with an edge within 1e-3 px of a search window's end, where derivatives jump,
 and in single precision derivatives: a threshold that rounding moves (a crossing of a contour, a
@@ -265,10 +266,14 @@ def compare(cost: TrackingCost, x: Tensor, dtype: Any) -> tuple[float, float]:
     engine = replace(cost, engine=FusedEngine(dtype))
     fused = engine.local_model(x)
     allowed = NATS[dtype] + RELATIVE[dtype] * eager.value.abs()
+    moved = x + 0.01 * torch.cos(100 * x)  # some way from where matches are found
     value = max(
         float(((found - eager.value).abs() / allowed).max())
         for found in (fused.value, engine.value(x))
     )
+    held = engine.held_value(moved, x), replace(cost, engine=None).held_value(moved, x)
+    difference = (held[0] - held[1]).abs() / (NATS[dtype] + RELATIVE[dtype] * held[1].abs())
+    value = max(value, float(difference.max()))
     if dtype == "float32":
         return value, 0.0
     largest = [

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 from made_costs import changed, make_full_cost, printed_cost, random_states
-from made_engines import assert_close, awkward_states, colours_of
+from made_engines import NATS, RELATIVE, assert_close, awkward_states, colours_of
+from torch import Tensor
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
@@ -22,7 +23,8 @@ from torchcss.cost.fused.engine import FusedEngine
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.repulsion import add_repulsion
 from torchcss.cost.fused.view import add_view
-from torchcss.cost.total import beside, numbered, together
+from torchcss.cost.total import TrackingCost, beside, numbered, together
+from torchcss.errors import ShapeError
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import checked
 from torchcss.types import Curvature, LocalModel
@@ -35,6 +37,60 @@ BODIES = ["arm8", "arm7", "body30", "body32", "body34"]
 def test_the_engines_agree(name: str, dtype: str, generator: torch.Generator) -> None:
     cost = colours_of(make_full_cost(name, own_parents=12))
     assert_close(cost, random_states(cost.body, 12, generator=generator), dtype)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("name", BODIES)
+def test_matches_that_are_held(name: str, dtype: str, generator: torch.Generator) -> None:
+    cost = colours_of(make_full_cost(name, own_parents=26))
+    found_at = torch.cat(
+        [random_states(cost.body, 12, generator=generator), awkward_states(cost, generator)]
+    )
+    # States that follow one another share what is found if they are the same.
+    found_at[1:4] = found_at[0]
+    step = torch.randn(found_at.shape, generator=generator, dtype=torch.float64)
+    x = found_at + 0.02 * step
+    assert_held_close(cost, x, found_at, dtype)
+    parent = torch.zeros(len(x), dtype=torch.long)
+    assert_held_close(replace(cost, parent=parent, component=None), x, found_at, dtype)
+
+
+@pytest.mark.parametrize("preset", ["ijrr_css", "rr_multiple_hypothesis"])
+def test_printed_matches_that_are_held(preset: str, generator: torch.Generator) -> None:
+    cost = printed_cost(make_full_cost("body34"), preset)
+    found_at = random_states(cost.body, 6, generator=generator)
+    assert_held_close(cost, found_at + 0.01, found_at, "float64")
+
+
+def assert_held_close(cost: TrackingCost, x: Tensor, found_at: Tensor, dtype: str) -> None:
+    fused = replace(cost, engine=FusedEngine(dtype))  # type: ignore[arg-type]
+    got, expected = fused.held_value(x, found_at), cost.held_value(x, found_at)
+    torch.testing.assert_close(got, expected, rtol=RELATIVE[dtype], atol=NATS[dtype])
+    nothing_moved = fused.held_value(found_at, found_at)
+    torch.testing.assert_close(nothing_moved, fused.value(found_at), rtol=1e-6, atol=1e-4)
+
+
+def test_derivatives_are_those_of_the_cost_with_matches_held(generator: torch.Generator) -> None:
+    cost = colours_of(make_full_cost("body34"))
+    cost = replace(cost, engine=FusedEngine("float64"))
+    x = random_states(cost.body, generator=generator)
+    at = x.expand(cost.body.num_parameters, -1).contiguous()
+    h = 1e-5 * torch.eye(len(at), dtype=x.dtype)
+    slope = (cost.held_value(at + h, at) - cost.held_value(at - h, at)) / 2e-5
+    expected = cost.local_model(x).gradient
+    torch.testing.assert_close(slope, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+
+
+def test_a_state_that_is_none_gives_none_where_matches_are_held(
+    generator: torch.Generator,
+) -> None:
+    cost = replace(make_full_cost("arm8"), engine=FusedEngine())
+    x = random_states(cost.body, 3, generator=generator)
+    found_at = x.clone()
+    found_at[1] = torch.nan
+    assert cost.held_value(x, found_at).isnan().tolist() == [False, True, False]
+    with pytest.raises(ShapeError, match="found_at"):
+        cost.held_value(x, found_at[:2])
 
 
 def test_kernels_are_compiled_once_for_each_precision() -> None:
@@ -126,7 +182,7 @@ def test_printed_costs(name: str, preset: str, dtype: str, generator: torch.Gene
 CHECK = """
 import torch
 from dataclasses import replace
-from made_engines import assert_close, awkward_states, colours_of
+from made_engines import NATS, RELATIVE, assert_close, awkward_states, colours_of
 from made_costs import make_full_cost, printed_cost
 cost = colours_of(make_full_cost("arm8"))
 x = awkward_states(cost, torch.Generator().manual_seed(0))[[0, 7, 9]]

@@ -79,6 +79,10 @@ class Engine(Protocol):
         """See `TrackingCost.value`."""
         ...
 
+    def held_value(self, cost: TrackingCost, x: States, found_at: States) -> Costs:
+        """See `TrackingCost.held_value`."""
+        ...
+
     def local_model(self, cost: TrackingCost, x: States) -> LocalModel:
         """See `TrackingCost.local_model`."""
         ...
@@ -255,6 +259,25 @@ class TrackingCost:
             lambda part: {"": torch.stack(list(part.values().values())).sum(0)}, x
         )[""]
 
+    def held_value(self, x: States, found_at: States) -> Costs:
+        """Cost in nats with the visibility and the assignments that other states have.
+
+        It is the function of x whose derivatives at x = `found_at` are those of `local_model`. It
+        has none for autograd.
+
+        Args:
+            x: States.
+            found_at: The states, as many, at which visibility and assignments are found. Those that
+                follow one another and are the same share what is found.
+        """
+        self._check(x)
+        self._check(found_at)
+        if x.shape != found_at.shape:
+            raise ShapeError(f"found_at: expected {list(x.shape)}, got {list(found_at.shape)}")
+        if self.engine is not None:
+            return self.engine.held_value(self, x.detach(), found_at.detach())
+        return self._evaluated(lambda part: {"": part.held_value()}, found_at, x)[""]
+
     def terms(self, x: States) -> dict[str, Costs]:
         """Cost of every term and prior by name, nats."""
         if self.engine is None or not x.numel():
@@ -325,10 +348,11 @@ class TrackingCost:
         return max(1, min(CHUNK, CHUNK_NODES // nodes) * more)
 
     def _evaluated(
-        self, evaluate: Callable[[_Part], dict[str, Tensor]], x: States
+        self, evaluate: Callable[[_Part], dict[str, Tensor]], x: States, at: States | None = None
     ) -> dict[str, Tensor]:
         """Evaluate sequence by sequence, a chunk at a time, and put the results together."""
         flat, found, order = x.detach().reshape(-1, x.shape[-1]), [], []
+        moved = flat if at is None else at.detach().reshape(flat.shape)
         component = self.parent if self.component is None else self.component
         for past in self.past:
             items = torch.arange(len(flat), device=x.device)
@@ -339,7 +363,8 @@ class TrackingCost:
             views = [view for view in self.views if view.sequence == past.sequence]
             for some in items.split(self._chunk):
                 of = (None if each is None else each[some] for each in (self.parent, component))
-                found.append(evaluate(_Part(self, past.body, past, views, flat[some], *of)))
+                states = flat[some], moved[some]
+                found.append(evaluate(_Part(self, past.body, past, views, *states, *of)))
                 order.append(some)
         names = dict.fromkeys(name for part in found for name in part)
         results = {name: _joined(name, found, order) for name in names}
@@ -385,13 +410,17 @@ class _Opaque(torch.autograd.Function):
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Some samples of one sequence, few enough to be evaluated at once."""
+    """Some samples of one sequence, few enough to be evaluated at once.
+
+    What is held is found at the states `x`; the samples have `moved` since.
+    """
 
     cost: TrackingCost
     body: BodyModel
     past: FrameContext
     views: Sequence[FrameContext]
     x: Float[Tensor, "b n"]
+    moved: Float[Tensor, "b n"]
     parent: Indices | None
     component: Indices | None
 
@@ -458,20 +487,25 @@ class _Part:
 
     def _by_autograd(self) -> LocalModel:
         """The same by differentiating the cost as a function of x, with what was found held."""
-        found = self._pose()
         with torch.enable_grad():
             leaf = self.x.detach().requires_grad_()
-            pose = self.body.pose(leaf)
-            total = 0.0 * leaf.sum(-1)
-            for _, scale, term, posed in self._terms(found):
-                link, points = term.link, term.points(posed)
-                away = points - found.tree.translation[..., link, :]
-                local = (found.tree.rotation[..., link, :, :] * away[..., :, None]).sum(-2)
-                at = self.body.points_on_links(pose.tree, link, local)
+            return differentiate_twice(replace(self, moved=leaf).held_value(), leaf)
+
+    def held_value(self) -> Float[Tensor, " b"]:
+        """Cost of the samples that have moved, with what was found before."""
+        found = self._pose()
+        pose = self.body.pose(self.moved)
+        total = 0.0 * self.moved.sum(-1)
+        for name, scale, term, posed in self._terms(found):
+            link, points = term.link, term.points(posed)
+            away = points - found.tree.translation[..., link, :]
+            local = (found.tree.rotation[..., link, :, :] * away[..., :, None]).sum(-2)
+            at = self.body.points_on_links(pose.tree, link, local)
+            with self.cost.timed(name):
                 total = total + scale * term.value(posed, at).sum(-1)
-            for _, weight, prior, posed in self._bound("prior", pose):
-                total = total + weight * prior.value(posed)
-            return differentiate_twice(total, leaf)
+        for _, weight, prior, posed in self._bound("prior", pose):
+            total = total + weight * prior.value(posed)
+        return total
 
     def _pose(self) -> BodyPose:
         with self.cost.timed("pose"):

@@ -175,6 +175,10 @@ class _Collecting:
         """See `TrackingCost.value`."""
         return self.collector.evaluated(_Request("value", replace(cost, engine=self.engine), x))
 
+    def held_value(self, cost: TrackingCost, x: Tensor, found_at: Tensor) -> Tensor:
+        """See `TrackingCost.held_value`; no search asks for it."""
+        return replace(cost, engine=self.engine).held_value(x, found_at)
+
     def local_model(self, cost: TrackingCost, x: Tensor) -> LocalModel:
         """See `TrackingCost.local_model`."""
         return self.collector.evaluated(

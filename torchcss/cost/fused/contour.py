@@ -43,6 +43,12 @@ def compare_outline(
     if colours.scale > 0.0:
         match_colours(colours, workspace.seen, count)
     _pull_back(nodes, lens, workspace.seen, count, exact, workspace.points)
+    return sum_outline(nodes, edges, colours, workspace.seen, count)
+
+
+@kernel
+def sum_outline(nodes: Nodes, edges: Edges, colours: Colours, seen: Seen, count: int) -> float:
+    """Cost of all contour nodes, by what those that are seen gain."""
     hidden = edges.scale * edges.hidden + colours.scale * colours.hidden
     nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
     unmatched = edges.scale * edges.unmatched + 0.5 * colours.scale * colours.nu
@@ -51,8 +57,8 @@ def compare_outline(
         cost = nodes.visible[i] * unmatched + (1.0 - nodes.visible[i]) * hidden
         total += nodes.exists[i] * (cost - nothing)
     for k in range(count):
-        i = workspace.seen.node[k]
-        total -= nodes.exists[i] * nodes.visible[i] * workspace.seen.gain[k]
+        i = seen.node[k]
+        total -= nodes.exists[i] * nodes.visible[i] * seen.gain[k]
     return total
 
 

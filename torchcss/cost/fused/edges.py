@@ -112,7 +112,7 @@ def _weigh(edges: Edges, peaks: Peaks, total: int) -> None:
         weight = height * sharpness if within else 0.0
         squared = distance * distance
         rho, first, second = potential_of(edges.potential, squared)
-        peaks.weight[n] = weight
+        peaks.place[n], peaks.weight[n] = distance, weight
         peaks.share[n] = weight * min((edges.window - abs(distance)) * fade, 1.0)
         peaks.well[n] = max(edges.unmatched - 0.5 * rho, 0.0)
         peaks.slope[n] = first * distance
@@ -165,14 +165,43 @@ def _price(
 ) -> None:
     """Cost of an edge along a normal, and its derivatives."""
     distance = peaks.place[n]
-    weight = _weight_at(edges, place[0] + distance * normal[0], place[1] + distance * normal[1])
-    if edges.strength:
-        weight = weight * peaks.middle[n]
+    weight = _weight_of(edges, place, normal, peaks, n)
     squared = weight * distance * distance
     rho, first, second = potential_of(edges.potential, squared)
     peaks.well[n] = -0.5 * rho
     peaks.slope[n] = weight * first * distance
     peaks.curvature[n] = weight * (first + 2.0 * second * squared)
+
+
+@inlined
+def _weight_of(
+    edges: Edges, place: tuple[float, float], normal: tuple[float, float], peaks: Peaks, n: int
+) -> float:
+    """The weight of an edge along a normal, inside rho."""
+    distance = peaks.place[n]
+    weight = _weight_at(edges, place[0] + distance * normal[0], place[1] + distance * normal[1])
+    return weight * peaks.middle[n] if edges.strength else weight
+
+
+@kernel
+def held_gain(edges: Edges, seen: Seen, k: int, place: tuple[float, float], peaks: Peaks) -> float:
+    """What a node gains that has moved to a place in the image since its edges were found."""
+    along = seen.mu[k], seen.mv[k]
+    moved = (place[0] - seen.u[k]) * along[0] + (place[1] - seen.v[k]) * along[1]
+    share = gain = edges.scale * 0.0
+    for n in range(seen.first[k], seen.first[k + 1]):
+        before = peaks.place[n]
+        now = before - moved
+        share += peaks.share[n]
+        if edges.assignment == 0:
+            rho, _, _ = potential_of(edges.potential, now * now)
+            gain += peaks.weight[n] * (edges.unmatched - 0.5 * rho)
+        elif peaks.weight[n] > 0.0:
+            weight = _weight_of(edges, (seen.u[k], seen.v[k]), along, peaks, n)
+            was, _, _ = potential_of(edges.potential, weight * before * before)
+            rho, _, _ = potential_of(edges.potential, weight * now * now)
+            gain += peaks.well[n] + 0.5 * (was - rho)
+    return edges.scale / max(share, 1.0) * gain
 
 
 @inlined

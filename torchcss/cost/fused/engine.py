@@ -31,6 +31,7 @@ from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.contour import ContourTerm
 from torchcss.cost.flow import FlowTerm
 from torchcss.cost.fused import pack
+from torchcss.cost.fused.held import add_held_view
 from torchcss.cost.fused.pose_prior import add_pose_prior
 from torchcss.cost.fused.priors import add_priors
 from torchcss.cost.fused.records import Array, Curves, Limbs, Parts, Result, Tree, View
@@ -50,6 +51,9 @@ from torchcss.types import Curvature, LocalModel
 
 if TYPE_CHECKING:
     from torchcss.cost.total import TrackingCost
+
+States = Float[Tensor, "*batch n"]
+Costs = Float[Tensor, "*batch"]
 
 _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
     ContourTerm: ("edges", pack.pack_edges),
@@ -111,21 +115,34 @@ class _Packed(NamedTuple):
 
     Attributes:
         kernel: The kernel.
+        held: The kernel for states with what is held; None: nothing is.
         modes: How many modes before samples are compared with; zero: with none.
         records: What it reads.
         workspaces: Memory for what it finds on the way.
     """
 
     kernel: Callable[..., None]
+    held: Callable[..., None] | None
     modes: int
     records: tuple[Any, ...]
     workspaces: Workspaces
 
-    def add(self, x: Array, mode: Array | None, result: Result) -> None:
-        """Add the kernel's costs of some samples, each compared with a mode."""
-        rows = (_rows(mode, self.modes, len(x)),) if self.modes else ()
+    def add(self, states: Sequence[Array], mode: Array | None, result: Result) -> None:
+        """Add the kernel's costs of some samples, each compared with a mode.
+
+        Args:
+            states: The samples, and, if that is held, where visibility and matches are found.
+            mode: The mode of each.
+            result: What the costs are added to.
+        """
+        kernel = self.kernel
+        if len(states) > 1 and self.held is not None:
+            kernel = self.held
+        else:
+            states = states[:1]
+        rows = (_rows(mode, self.modes, len(states[0])),) if self.modes else ()
         with self.workspaces.lent() as workspace:
-            run(self.kernel, x, *rows, *self.records, workspace, result)
+            run(kernel, *states, *rows, *self.records, workspace, result)
 
 
 _Found = tuple[list[_Packed], frozenset[str]]
@@ -161,14 +178,21 @@ class FusedEngine:
         self._threads = threads
         self._helpers: dict[int, ThreadPoolExecutor] = {}  # by process: a fork has no threads
 
-    def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, cost: TrackingCost, x: States) -> Costs:
         """Cost in nats; see `TrackingCost.value`."""
         with cost.timed("fused"):
             result, others = self._evaluate(cost, x, slopes=False)
         value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
         return value if others is None else value + others.value(x)
 
-    def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def held_value(self, cost: TrackingCost, x: States, found_at: States) -> Costs:
+        """Cost in nats with what is found at other states; see `TrackingCost.held_value`."""
+        with cost.timed("fused"):
+            result, others = self._evaluate(cost, x, found_at, slopes=False)
+        value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
+        return value if others is None else value + others.held_value(x, found_at)
+
+    def local_model(self, cost: TrackingCost, x: States) -> LocalModel:
         """Cost, gradient and Hessian; see `TrackingCost.local_model`."""
         with cost.timed("fused"):
             result, others = self._evaluate(cost, x, slopes=True)
@@ -181,11 +205,17 @@ class FusedEngine:
         return model.plus(others.local_model(x))
 
     def _evaluate(
-        self, cost: TrackingCost, x: Tensor, *, slopes: bool
+        self, cost: TrackingCost, *states: Tensor, slopes: bool
     ) -> tuple[Result, TrackingCost | None]:
-        """What the kernels give, and the cost of what they leave out; None: nothing."""
-        states = pack.array(x.reshape(-1, x.shape[-1]))
-        size, n = states.shape
+        """What the kernels give, and the cost of what they leave out; None: nothing.
+
+        Args:
+            cost: The cost.
+            states: The samples, and, if that is held, where visibility and matches are found.
+            slopes: Whether to find derivatives.
+        """
+        each = [pack.array(x.reshape(-1, x.shape[-1])) for x in states]
+        size, n = each[0].shape
         width = n if slopes else 0
         result = Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
         parent, component = (
@@ -193,7 +223,7 @@ class FusedEngine:
             for index in (cost.parent, cost.component)
         )
         component = parent if component is None else component
-        sane = np.isfinite(states).all(1)
+        sane = np.logical_and.reduce([np.isfinite(x).all(1) for x in each])
         left_out: set[str] = set()
         for past in cost.past:
             items = None
@@ -201,7 +231,7 @@ class FusedEngine:
                 items = (cost.sequence == past.sequence).numpy() & sane
             elif not sane.all():
                 items = sane
-            part = states if items is None else np.ascontiguousarray(states[items])
+            part = each if items is None else [np.ascontiguousarray(x[items]) for x in each]
             own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
             packed, others = self._prior(cost, past)
             compared = component if component is None or items is None else component[items]
@@ -224,31 +254,35 @@ class FusedEngine:
         return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
 
     def _share_out(
-        self, calls: Sequence[tuple[_Packed, Array | None]], x: Array, result: Result
+        self,
+        calls: Sequence[tuple[_Packed, Array | None]],
+        states: Sequence[Array],
+        result: Result,
     ) -> None:
         """Add the costs that kernels find for some states, shared out among the threads.
 
         Args:
             calls: Kernels, with the modes that the states are compared with.
-            x: States.
+            states: The samples, and maybe where visibility and matches are found.
             result: What the costs are added to.
         """
+        size = len(states[0])
 
         def add(rows: slice) -> None:
-            part = Result(*(field[rows] for field in result))
+            part, some = Result(*(field[rows] for field in result)), [x[rows] for x in states]
             for packed, mode in calls:
-                packed.add(x[rows], None if mode is None else mode[rows], part)
+                packed.add(some, None if mode is None else mode[rows], part)
 
-        if self._threads < 2 or len(x) < 2:
+        if self._threads < 2 or size < 2:
             add(slice(None))
             return
         process = os.getpid()
         if process not in self._helpers:
             self._helpers[process] = ThreadPoolExecutor(self._threads - 1)
-        size = math.ceil(len(x) / self._threads)
-        others = [slice(i, i + size) for i in range(size, len(x), size)]
+        share = math.ceil(size / self._threads)
+        others = [slice(i, i + share) for i in range(share, size, share)]
         helped = [self._helpers[process].submit(add, rows) for rows in others]
-        add(slice(size))
+        add(slice(share))
         for each in helped:
             each.result()
 
@@ -273,7 +307,7 @@ class FusedEngine:
         if priors:
             records = pack.pack_priors(priors, past)
             workspaces = Workspaces(partial(pack.make_prior_scratch, records[-1]))
-            states = [_Packed(add_priors, records[0].centre.shape[1], records, workspaces)]
+            states = [_Packed(add_priors, None, records[0].centre.shape[1], records, workspaces)]
         return [*states, *repulsion, *limbs], frozenset(others)
 
     def _pack_limbs(self, weight: float, past: FrameContext) -> list[_Packed]:
@@ -290,7 +324,7 @@ class FusedEngine:
         limbs, workspaces = self._bodies.of(past.tables, (pack.pack_limbs, density), make)
         turned = limbs.fixed @ pack.array(camera.R_camera_world).T
         limbs = limbs._replace(scale=weight, fixed=turned)
-        return [_Packed(add_pose_prior, 0, (tree, limbs), workspaces)]
+        return [_Packed(add_pose_prior, None, 0, (tree, limbs), workspaces)]
 
     def _pack_repulsion(
         self, cost: TrackingCost, term: Interpenetration, weight: float, past: FrameContext
@@ -305,7 +339,7 @@ class FusedEngine:
         curves = pack.pack_curves(None, len(parts.row), real)
         records = tree, parts, repulsion, _is_exact(cost)
         memory = self._memory(tree, curves, interior, chain, 5, 0)
-        return _Packed(add_repulsion, 0, records, memory)
+        return _Packed(add_repulsion, None, 0, records, memory)
 
     def _tree(self, body: BodyModel, context: FrameContext) -> Tree:
         """A body before the camera of a frame, packed once."""
@@ -376,7 +410,9 @@ class FusedEngine:
         interior = view.flow.nodes.shape[2]
         keypoints = 64 * math.ceil(len(view.keypoints.row) / 64)  # for all of these one memory
         memory = self._memory(tree, view.curves, interior, 1, len(edges.steps), keypoints)
-        packed = _Packed(add_view, len(view.flow.target), (tree, parts, view), memory)
+        packed = _Packed(
+            add_view, add_held_view, len(view.flow.target), (tree, parts, view), memory
+        )
         return [packed], frozenset(others)
 
     def _pack_image(self, term: Any, bound: OnPoints, context: FrameContext) -> Any:

@@ -44,9 +44,19 @@ def _place(table: Array, frame: Array, start: int, nodes: Nodes) -> None:
 
 @kernel
 def follow_flow(
-    nodes: Nodes, lens: Lens, flow: Flow, mode: int, exact: bool, points: Points
+    nodes: Nodes, lens: Lens, flow: Flow, mode: int, exact: bool, held: bool, points: Points
 ) -> float:
-    """Cost of all nodes about the targets of a mode; the points get its derivatives."""
+    """Cost of all nodes about the targets of a mode; the points get its derivatives.
+
+    Args:
+        nodes: The nodes.
+        lens: The camera.
+        flow: The term.
+        mode: The mode.
+        exact: Whether the curvature of the projection counts.
+        held: Whether a node is as much in front of the camera as when this was last asked.
+        points: The points.
+    """
     total, count, target = 0.0, 0, flow.target[mode]
     size = flow.nodes.shape[2]
     for part in range(len(nodes.first) - 1):
@@ -60,6 +70,9 @@ def follow_flow(
             pixel = project(lens, x, y, z)
             if not pixel.valid:
                 near = 0.0 * lens.near
+            if held:
+                near = nodes.near[i]
+            nodes.near[i] = near
             cost = near * flow.back_facing
             facing, visible = nodes.exists[i], nodes.visible[i]
             if facing * near > 0.0:

@@ -298,7 +298,7 @@ Attributes:
 """
 
 
-Nodes = namedtuple("Nodes", "x y z nx ny nz exists visible first")
+Nodes = namedtuple("Nodes", "x y z nx ny nz exists visible near first")
 """Nodes on the surface, part after part.
 
 Attributes:
@@ -306,6 +306,7 @@ Attributes:
     nx, ny, nz: Unit outward normal.
     exists: Share with which the node is there, or with which it faces the camera.
     visible: 1 where no other part hides it, 0 where one does.
+    near: 1 where it is in front of the camera, of the nodes all over the surface.
     first: Where the nodes of each part begin, and the end of all.
 """
 

@@ -24,3 +24,16 @@ def match_colours(colours: Colours, seen: Seen, count: int) -> None:
         seen.uu[k] += level * (b.uu - a.uu)
         seen.uv[k] += level * (b.uv - a.uv)
         seen.vv[k] += level * (b.vv - a.vv)
+
+
+@kernel
+def held_contrast(colours: Colours, seen: Seen, k: int, place: tuple[float, float]) -> float:
+    """What a node gains that has moved to a place in the image since its normal was found."""
+    layer, u, v = int(colours.layer[seen.part[k]]), place[0], place[1]
+    du, dv, origin = colours.offset * seen.mu[k], colours.offset * seen.mv[k], colours.origin
+    inside, outside = (u - du, v - dv), (u + du, v + dv)
+    gain = colours.scale * 0.0
+    for (x, y), sign in ((inside, 1.0), (outside, -1.0)):
+        there = x - origin[0], y - origin[1]
+        gain += sign * sample_spline(colours.field, colours.corner, layer, there).value
+    return 0.25 * colours.scale * colours.nu * gain

@@ -89,7 +89,8 @@ def _flow(parts: Parts, view: View, mode: int, slopes: bool, workspace: Workspac
     nodes = workspace.interior
     find_interior(view.flow.nodes, workspace.posed, nodes)
     see_nodes(nodes, workspace.posed, parts, False, workspace.rays, workspace.near, workspace.lines)
-    cost = follow_flow(nodes, view.lens, view.flow, mode, view.exact, workspace.points)
+    flow, points = view.flow, workspace.points
+    cost = follow_flow(nodes, view.lens, flow, mode, view.exact, False, points)
     if slopes:
         _sum_parts(parts, workspace)
     return cost
