@@ -280,6 +280,13 @@ class Keypoints(NamedTuple):
         )
 
 
+TIME_ROUNDING = 1 / 600
+"""Seconds by which containers round the time between two frames, at most: QuickTime counts 600ths,
+Matroska thousandths. Frames that are evenly spaced but for that are tracked as if their times were
+not known: at 30 a second it would move deviations by less than 3 %, far less than is known of
+them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One image of a video.

@@ -14,7 +14,7 @@ from torchcss.app.undistort import undistort_video
 from torchcss.cli import main as cli
 from torchcss.errors import CameraError, KeypointError
 from torchcss.io.cameras import load_camera, load_lens
-from torchcss.io.video import VideoReader
+from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.io.view_files import ViewFiles
 
 SIZE = (128, 96)
@@ -91,6 +91,18 @@ def test_the_command_that_the_refusal_gives(
     assert float(load_camera(folder / "cameras.json").camera.K[0, 0]) == pytest.approx(
         64 / np.tan(np.radians(50))
     )
+
+
+def test_frames_keep_their_times(recorded: Path) -> None:
+    """Of a film that drops frames the straight one drops as many."""
+    times = [0.0, 0.04, 0.12]
+    images = [frame.image for frame in VideoReader(recorded / "wide.mp4")]
+    with VideoWriter(recorded / "wide.mp4", 25) as film:
+        for image, time in zip(images, times, strict=True):
+            film.write(image, time)
+    paths, notes = undistort_video(files(recorded), recorded / "lens.json", recorded / "straight")
+    assert VideoReader(paths[0]).frame_times() == pytest.approx(times, abs=1e-4)
+    assert any("variable frame rate" in note for note in notes)
 
 
 def test_a_camera_without_a_place_stays_without(recorded: Path) -> None:

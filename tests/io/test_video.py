@@ -8,7 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -290,21 +290,27 @@ def test_ten_bits_of_high_dynamic_range(
         np.testing.assert_allclose(frame.image, level, atol=3)
 
 
+def film_with_times(path: Path, ticks: Iterable[int], rate: int) -> VideoReader:
+    """A film whose frames are shown at these ticks, so many a second."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30, options={"bf": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, rate)
+        for index, tick in enumerate(ticks):
+            image = np.full((48, 64, 3), grey_level(index), np.uint8)
+            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+            picture.pts, picture.time_base = int(tick), Fraction(1, rate)
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    return VideoReader(path)
+
+
 def test_variable_frame_rates(tmp_path: Path) -> None:
     """Every frame has the time at which it was filmed; the rate is the mean one."""
     path = tmp_path / "a.mp4"
     ticks = np.cumsum(np.random.default_rng(0).integers(1, 4, 30)) - 1
     ticks -= ticks[0]
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"bf": "0"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = Fraction(1, 30)
-        for index, tick in enumerate(ticks):
-            image = np.full((48, 64, 3), grey_level(index), np.uint8)
-            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
-            picture.pts, picture.time_base = int(tick), Fraction(1, 30)
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode(None))
+    film_with_times(path, ticks, 30)
     reader = VideoReader(path)
     assert reader.num_selected == len(ticks)
     assert [frame.time_s * 30 for frame in reader] == pytest.approx(ticks)
@@ -313,6 +319,39 @@ def test_variable_frame_rates(tmp_path: Path) -> None:
     assert means == pytest.approx([grey_level(index) for index in range(30)], abs=3)
     assert float(reader.info.frame_rate) == pytest.approx(30 * 30 / ticks[-1], rel=0.1)
     assert "are shown for 33 to 100 ms (variable frame rate)" in str(reader.varying_rate())
+
+
+def test_the_usual_interval_is_that_of_most_frames(tmp_path: Path) -> None:
+    """Where every second frame of a part is missing, the others are as far apart as ever."""
+    ticks = [*range(12), *range(12, 24, 2), *range(24, 30)]
+    reader = film_with_times(tmp_path / "a.mp4", ticks, 30)
+    assert reader.varies
+    assert reader.usual_interval == pytest.approx(1 / 30)
+    assert reader.info.frame_rate < 27
+    assert VideoReader(tmp_path / "a.mp4", stride=3).usual_interval == pytest.approx(3 / 30)
+
+
+@pytest.mark.parametrize(("name", "rate"), [("a.mkv", 1000), ("a.mov", 600)])
+def test_rounded_times_are_even(tmp_path: Path, name: str, rate: int) -> None:
+    """Times in milliseconds, and in QuickTime's 600ths of 29.97 frames a second."""
+    ticks = [round(index * rate * 1001 / 30000) for index in range(35)]
+    assert len(set(np.diff(ticks))) == 2
+    reader = film_with_times(tmp_path / name, ticks, rate)
+    assert not reader.varies
+    assert reader.varying_rate() is None
+    assert reader.usual_interval == 1 / float(reader.info.frame_rate)
+
+
+def test_a_film_with_times_of_its_frames(tmp_path: Path) -> None:
+    """Told by the frames: Matroska's header goes on saying 25 a second."""
+    times = [0.0, 0.04, 0.08, 0.2, 0.213]
+    for name, accuracy in (("a.mp4", 1e-4), ("a.mkv", 1e-3)):
+        with VideoWriter(tmp_path / name, 25) as film:
+            for time in times:
+                film.write(np.zeros((48, 64, 3), np.uint8), time)
+        reader = VideoReader(tmp_path / name)
+        assert reader.frame_times() == pytest.approx(times, abs=accuracy)
+        assert reader.varies
 
 
 def test_an_edit_list_hides_frames(tmp_path: Path) -> None:

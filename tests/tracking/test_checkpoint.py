@@ -102,6 +102,25 @@ def test_everything_that_the_next_frame_needs_is_in_it() -> None:
         assert name in names
 
 
+def test_the_times_of_frames_are_gone_on_with() -> None:
+    """A frame that comes late after a checkpoint is known to be late, in search and windows."""
+    settings = replace(SETTINGS, terms=None)
+    frames, session = sequence_and_session(settings)
+    late = [replace(frame, time_s=frame.time_s + INTERVAL * (frame.index > 2)) for frame in frames]
+    for _ in session.track(late[:3]):
+        pass
+    state = state_from_tensors(state_tensors(session.checkpoint()), session.state.body)
+    assert state.times == session.state.times
+    views = [observer.view for observer in session._observers]
+    resumed = TrackingSession.resume(state, settings, views, frame_interval=INTERVAL)
+    for one, other in zip(session.track(late[3:5]), resumed.track(late[3:5]), strict=True):
+        assert torch.equal(one.state.mixture.mean, other.state.mixture.mean)
+    # A checkpoint of before they were kept takes the first interval for a usual one.
+    tensors = state_tensors(state)
+    del tensors["times"]
+    assert state_from_tensors(tensors, state.body).times == ()
+
+
 def test_observing_ahead_changes_nothing() -> None:
     frames, session = sequence_and_session(replace(SETTINGS, terms=None))
     _, ahead = sequence_and_session(replace(SETTINGS, terms=None))

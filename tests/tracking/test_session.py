@@ -30,7 +30,8 @@ from torchcss.initialise.result import Initialisation
 from torchcss.initialise.view import CameraView
 from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
-from torchcss.io.run import body_of_track
+from torchcss.io.run import Run, body_of_track
+from torchcss.io.video import VideoWriter
 from torchcss.robust import Quadratic
 from torchcss.studies.demo import run_demo
 from torchcss.studies.render.sequences import SyntheticSequence
@@ -708,6 +709,97 @@ def test_pixels_alone_are_the_next_frame():
         assert (one.frame.index, one.frame.time_s) == (other.frame.index, other.frame.time_s)
     with pytest.raises(ConfigurationError, match="one of each of the 1 views"):
         plain.observe([sequence.frames[0], sequence.frames[1]])
+
+
+TIMED = {
+    preset: Settings(body="arm8", preset=preset, working_size=160, samples=4, modes=2)
+    for preset in ("css", "cham_rehg", "condensation", "rr_multiple_hypothesis")
+} | {"surface": Settings(body="arm8", working_size=160, samples=4, modes=2, prediction="surface")}
+
+
+@pytest.mark.parametrize("name", TIMED)
+def test_even_times_are_as_if_there_were_none(name: str):
+    """To the bit, also where a container has rounded them to milliseconds, or they do not rise."""
+    sequence = rendered_arm(0, 5)
+    rounded = [round(1000 * i / 25.3) / 1000 for i in range(5)]
+    for times in (rounded, [0.0] * 5):
+        first, view = start_at(sequence.body, sequence.states[0]), seen_by(sequence.camera)
+        plain, timed = (
+            TrackingSession(TIMED[name], first, view, frame_interval=1 / 25.3) for _ in range(2)
+        )
+        given = [Frame(i, times[i], image) for i, image in enumerate(sequence.frames)]
+        for one, other in zip(plain.track(sequence.frames), timed.track(given), strict=True):
+            assert torch.equal(one.state.mixture.mean, other.state.mixture.mean)
+            assert torch.equal(one.covariance, other.covariance)
+            assert torch.equal(one.state.velocity, other.state.velocity)
+
+
+@pytest.mark.parametrize("name", TIMED)
+def test_a_frame_that_comes_late_may_have_moved_more(name: str):
+    """The frame before it was dropped: noise, prior and motion are of two steps."""
+    sequence = rendered_arm(0, 5)
+    first, view = start_at(sequence.body, sequence.states[0]), seen_by(sequence.camera)
+    session = TrackingSession(TIMED[name], first, view)
+    costs = []
+
+    def seen(cost: TrackingCost) -> TrackingCost:
+        costs.append(cost)
+        return cost
+
+    *before, late = [Frame(i, i / 25, sequence.frames[i]) for i in (0, 1, 2, 4)]
+    for frame in before:
+        last = session.step(session.observe(frame), seen)
+    assert session.state.times == (1 / 25, 2 / 25)
+    now = session.step(session.observe(late), seen)
+    deviation = [cost.views[0].deviation for cost in costs]
+    torch.testing.assert_close(deviation[-1], math.sqrt(2) * deviation[-2])
+    if name == "rr_multiple_hypothesis":
+        return  # has no dynamics
+    velocity = now.state.mixture.mean - last.state.mixture.mean[now.info.parent]
+    matched = (now.info.parent >= 0) & (now.state.velocity != 0).any(-1)
+    kept_velocity = session.state.tracker.velocity
+    torch.testing.assert_close(2 * kept_velocity[matched], velocity[matched])
+    plan, noise = session.plan.tracker, PRESETS[TIMED[name].preset].noise
+    moved = now.info.prior.mixture.mean[: len(last.state.velocity)] - last.state.mixture.mean
+    kept = PRESETS[TIMED[name].preset].persistence
+    if name != "surface":
+        expected = (kept + kept**2) * last.state.velocity
+        torch.testing.assert_close(moved, expected)
+    wider = now.info.prior.mixture.covariance[: len(moved)] - last.state.mixture.covariance
+    if name in ("css", "condensation", "surface"):
+        motion = 2 * (noise * sequence.body.motion_rate / 25).square()
+        torch.testing.assert_close(wider, torch.diag(motion).expand_as(wider))
+    assert plan is session.plan.tracker  # that of the next frame is the usual one
+
+
+def test_a_film_that_drops_frames_is_tracked_at_its_own_times(clip: Path, tmp_path: Path):
+    """And goes on so: what is known of a frame that came late is in the checkpoint."""
+    made = rendered_arm(3, 6)
+    times = [0, 1, 2, 4, 6]
+    with VideoWriter(tmp_path / "video.mp4", made.frame_rate) as film:
+        for place in times:
+            film.write(made.frames[place % 6], place / made.frame_rate)
+    uv = made.camera.project(made.joints_world).uv.numpy()[[0, 1, 2, 4, 5]]
+    np.savez(
+        tmp_path / "keypoints.npz", keypoints=uv, confidence=np.ones(uv.shape[:2]),
+        joint_names=np.array(made.body.joint_names),
+    )  # fmt: skip
+
+    def tracked(out: str, stop: int | None, resume: bool = False) -> Run:
+        return track_video(
+            tmp_path / "video.mp4", camera=clip / "cameras.json",
+            keypoints=tmp_path / "keypoints.npz", out=tmp_path / out, stop=stop,
+            settings=Settings(body="arm7", samples=6, modes=2, overlay=False, working_size=160),
+            options=TrackOptions(init=clip / "first" / "body.npz", resume=resume),
+        )  # fmt: skip
+
+    whole = tracked("whole", None)
+    assert whole.summary["frame_interval_s"] == pytest.approx(1 / made.frame_rate, rel=1e-3)
+    np.testing.assert_allclose(whole.track.times, np.array(times) / made.frame_rate, atol=1e-4)
+    assert any("variable frame rate" in note for note in whole.summary["notes"])
+    tracked("parts", 3)
+    resumed = tracked("parts", None, resume=True)
+    np.testing.assert_array_equal(resumed.track.state, whole.track.state)
 
 
 def test_a_session_with_parts_of_its_own_is_resumed_with_them():

@@ -104,7 +104,7 @@ class Recorder:
         folder: The output folder.
         session: What is run.
         recorded: The cameras with their files.
-        frame_interval: Seconds between frames.
+        frame_interval: Seconds between frames as a rule.
         size_deviation: What is not known of the body's size, see `Track`.
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary; a resumed run keeps those that it is not given.

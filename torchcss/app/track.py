@@ -183,7 +183,7 @@ def _begin(
     seen = zip(names, views, strict=True)
     notes = [*(name + note for name, view in seen for note in view.notes), *first.report]
     tqdm.write("\n".join(notes))
-    interval = options.stride / float(views[0].reader.info.frame_rate)
+    interval = views[0].reader.usual_interval
     looking = [opened.view(first.body.tie) for opened in views]
     session = TrackingSession(
         settings, first, looking, frame_interval=interval, generator=generator
@@ -349,7 +349,7 @@ def _go_on(
     views = open_run(run, selection)
     body = run.body.to(dtype=settings.torch_dtype, device=settings.device)
     state = state_from_tensors(checkpoint.tensors, body)
-    interval = selection.stride / float(views[0].reader.info.frame_rate)
+    interval = views[0].reader.usual_interval
     session = TrackingSession.resume(
         state, settings, [opened.view(body.tie) for opened in views], frame_interval=interval
     )
@@ -377,7 +377,7 @@ def _record(recorder: Recorder, views: Sequence[OpenView]) -> Run:
         from torchcss.show.report import write_report_page
 
         _now("drawing overlay and report")
-        write_overlays(run, 1 / recorder.frame_interval)
+        write_overlays(run, views[0].reader.selected_rate)
         write_report_page(run)
     return run
 

@@ -69,7 +69,8 @@ def undistort_video(
     source = lens.source_pixels(size, K)
     with VideoWriter(video, reader.info.frame_rate, crf=_CRF) as film:
         for frame in tqdm(reader, "straight", reader.num_selected, unit="frame", file=sys.stderr):
-            film.write(straight_image(frame.image, source))
+            shown = frame.time_s if reader.varies else None
+            film.write(straight_image(frame.image, source), shown)
     notes = [loaded.units_note, reader.varying_rate()]
     written: dict[str, Any] = calibration((straight, video))
     if not loaded.metric:

@@ -15,6 +15,9 @@ give.
 
 from __future__ import annotations
 
+import math
+from copy import copy
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -66,6 +69,13 @@ class FrameCosts:
         self.engine = engine
         self.tables = BodyTables(body)
         self.num_layers = len(part_layers(body)[0])
+
+    def over(self, intervals: float) -> FrameCosts:
+        """The same of a frame that comes so many intervals after the one before it."""
+        costs = copy(self)
+        if self.deviation is not None:
+            costs.deviation = math.sqrt(intervals) * self.deviation
+        return costs
 
     def __call__(
         self,

@@ -3,10 +3,17 @@
 The paper uses trivial driftless diffusion and leaves the search to the covariances: `Diffusion`.
 `ConstantVelocity` moves every mode on as it moved last; it helps on smooth motion and misleads on
 sudden turns. What to call by default: `Diffusion(deviation=...)`.
+
+Both are of one interval between frames, the usual one. A frame that comes later, because those
+before it were dropped, is predicted as if they had been there and had shown nothing (`over`): over
+r intervals variances are r times as large, and a mode goes on by `p + p^2 + ... + p^r` of its
+velocity, p being the share that it keeps.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -26,6 +33,13 @@ def noise_covariance(deviation: Deviation, like: Matrices) -> Float[Tensor, "n n
     return torch.diag_embed(noise.square().expand(like.shape[-1]))
 
 
+def summed(deviation: Deviation, intervals: float) -> Deviation:
+    """Standard deviation of the noise of so many intervals together."""
+    factor = math.sqrt(intervals)
+    many = isinstance(deviation, tuple)
+    return tuple(factor * each for each in deviation) if many else factor * deviation
+
+
 class Dynamics(Protocol):
     """Anything that predicts a mixture one frame ahead."""
 
@@ -34,8 +48,12 @@ class Dynamics(Protocol):
 
         Args:
             mixture: Posterior of this frame.
-            velocity: How far each mode moved since the last frame; zero for a new mode.
+            velocity: How far each mode moved in the last interval; zero for a new mode.
         """
+        ...
+
+    def over(self, intervals: float) -> Dynamics:
+        """The same of a frame that comes so many intervals after the one before it."""
         ...
 
 
@@ -55,6 +73,10 @@ class Diffusion:
         motion = noise_covariance(self.deviation, mixture.covariance)
         return mixture._replace(covariance=mixture.covariance + motion)
 
+    def over(self, intervals: float) -> Diffusion:
+        """See `Dynamics.over`."""
+        return replace(self, deviation=summed(self.deviation, intervals))
+
 
 @frozen
 class ConstantVelocity:
@@ -72,3 +94,12 @@ class ConstantVelocity:
         """Add the velocity to the means and the variance of its change to the covariances."""
         moved = mixture._replace(mean=mixture.mean + self.persistence * velocity)
         return Diffusion(deviation=self.deviation).predict(moved, velocity)
+
+    def over(self, intervals: float) -> ConstantVelocity:
+        """See `Dynamics.over`."""
+        kept, whole = self.persistence, intervals
+        if kept != 1:
+            whole = (1 - kept**intervals) / (1 - kept)
+        return ConstantVelocity(
+            deviation=summed(self.deviation, intervals), persistence=kept * whole
+        )

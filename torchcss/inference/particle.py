@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import field
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import torch
@@ -87,6 +87,10 @@ class _Filter(SequenceTracker):
     """
 
     dynamics: Dynamics = field(default_factory=Diffusion)
+
+    def over(self, intervals: float) -> SequenceTracker:
+        """See `SequenceTracker.over`."""
+        return replace(self, dynamics=self.dynamics.over(intervals))
 
     @abstractmethod
     def _weigh(

@@ -35,6 +35,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import accumulate, pairwise
 from typing import NamedTuple
@@ -44,7 +45,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError
-from torchcss.inference.dynamics import Deviation, noise_covariance
+from torchcss.inference.dynamics import Deviation, noise_covariance, summed
 from torchcss.inference.mixture import GaussianMixture, MixtureSamples, Prior
 from torchcss.linalg import cholesky_apply, log_determinant, mask_free, multiply
 from torchcss.types import Bounds, Items, Matrices, Numbers, Vectors, frozen
@@ -96,6 +97,10 @@ class Proposal(ABC):
     def log_density(self, mixture: GaussianMixture, x: Vectors) -> Numbers:
         """Log-density of what is drawn at random, before projection; `-inf` if nothing is."""
         return torch.full_like(x[..., 0], -math.inf)
+
+    def over(self, intervals: float) -> Proposal:
+        """The same of a frame so many intervals after the one before: its own noise adds up."""
+        return self
 
 
 def unbounded(like: Vectors) -> Bounds:
@@ -450,6 +455,10 @@ class Condensation(_RandomProposal):
         noise = noise_covariance(self.deviation, mixture.covariance)
         return _Law(mixture._replace(covariance=noise.expand_as(mixture.covariance)))
 
+    def over(self, intervals: float) -> Condensation:
+        """See `Proposal.over`."""
+        return replace(self, deviation=summed(self.deviation, intervals))
+
 
 @frozen
 class ChamRehg(_RandomProposal):
@@ -480,6 +489,10 @@ class ChamRehg(_RandomProposal):
         """Gaussians widened by noise, each in its own piece of the state space."""
         covariance = mixture.covariance + noise_covariance(self.deviation, mixture.covariance)
         return _Law(mixture._replace(covariance=covariance), piecewise=self.piecewise)
+
+    def over(self, intervals: float) -> ChamRehg:
+        """See `Proposal.over`."""
+        return replace(self, deviation=summed(self.deviation, intervals))
 
 
 @frozen
@@ -513,6 +526,10 @@ class InflatedPosterior(_ScaledProposal):
             self.deviation, mixture.covariance
         )
         return _Law(GaussianMixture(mixture.mean, covariance, mixture.log_weight / scale))
+
+    def over(self, intervals: float) -> InflatedPosterior:
+        """See `Proposal.over`."""
+        return replace(self, deviation=summed(self.deviation, intervals))
 
 
 @frozen
@@ -585,6 +602,10 @@ class MixtureOfProposals(Proposal):
             raise ConfigurationError(
                 f"MixtureOfProposals.shares: expected positive numbers, got {shares}"
             )
+
+    def over(self, intervals: float) -> MixtureOfProposals:
+        """See `Proposal.over`."""
+        return replace(self, proposals=tuple(each.over(intervals) for each in self.proposals))
 
     @property
     def _shares(self) -> tuple[float, ...]:

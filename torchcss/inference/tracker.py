@@ -98,7 +98,8 @@ class TrackerState(NamedTuple):
 
     Attributes:
         mixture: Posterior of the last frame, the best mode first.
-        velocity: How far each mode moved in the last frame; zero for a new mode.
+        velocity: How far each mode moved in the last frame, a usual interval (`per_interval`); zero
+            for a new mode.
         generator_state: State of the random number generator.
         frame: Number of frames seen, a scalar.
         particles: What the mixture sums up, for particle filters; where the next frame's descents
@@ -111,6 +112,15 @@ class TrackerState(NamedTuple):
     generator_state: UInt8[Tensor, " bytes"]
     frame: Int[Tensor, ""]
     particles: Particles | None = None
+
+    def per_interval(self, intervals: float) -> TrackerState:
+        """The same after a frame that came so many intervals late: its velocities are of one."""
+        if intervals == 1:
+            return self
+        particles = self.particles
+        if particles is not None:
+            particles = particles._replace(velocity=particles.velocity / intervals)
+        return self._replace(velocity=self.velocity / intervals, particles=particles)
 
 
 class TrackerInfo(NamedTuple):
@@ -199,6 +209,10 @@ class SequenceTracker(ABC):
             generator_state=generator.get_state(),
             frame=torch.zeros((), dtype=torch.long),
         )
+
+    def over(self, intervals: float) -> SequenceTracker:
+        """The tracker of a frame that comes so many intervals after the one before it."""
+        return self
 
     @abstractmethod
     def step(
@@ -356,6 +370,11 @@ class Tracker(SequenceTracker):
     def stated_power(self) -> float:
         """The power that the weights have."""
         return self.likelihood_power
+
+    def over(self, intervals: float) -> Tracker:
+        """See `SequenceTracker.over`."""
+        dynamics, proposal = self.dynamics.over(intervals), self.proposal.over(intervals)
+        return replace(self, dynamics=dynamics, proposal=proposal)
 
     def step(
         self, state: TrackerState, problem: SearchProblem, bounds: Bounds

@@ -22,21 +22,21 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise, takewhile
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
 from torchcss.files import StrPath, naming, one_line, output_error, temporary_name
 from torchcss.io.high_dynamic_range import table
 from torchcss.joint_names import names_in
-from torchcss.types import Frame
+from torchcss.types import TIME_ROUNDING, Frame
 
 if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
     from av import VideoFrame
@@ -57,6 +57,9 @@ _MOST_PIXELS = 2**27
 """Of a video's picture, which a small file may make large; Pillow refuses large images itself."""
 
 _SECONDS_BETWEEN_KEY_FRAMES = 1
+
+_TICKS = 90_000
+"""In a second, of films whose frames have times of their own, as in most containers."""
 
 _SEGMENT = b"\x18\x53\x80\x67"
 """What stands before the size of a Matroska file's only large part."""
@@ -109,7 +112,6 @@ class VideoReader:
 
     info: VideoInfo
     pixel_aspect = Fraction(1)
-    _is_even = True
 
     def __init__(
         self,
@@ -177,16 +179,41 @@ class VideoReader:
         begin = min(times, default=0.0)
         return sorted(time - begin for time in times) if self.count_frames() == len(times) else None
 
+    @property
+    def selected_rate(self) -> float:
+        """Mean frames per second of those that an iteration yields."""
+        return float(self.info.frame_rate) / self._stride
+
+    @cached_property
+    def _steps(self) -> np.ndarray:
+        """Seconds from each frame of a file to the next; what its header says need not be so."""
+        return np.diff([] if self._images else self.frame_times() or [])
+
+    @property
+    def varies(self) -> bool:
+        """Whether some frames are shown for longer than others, by more than rounding."""
+        off = np.abs(self._steps - 1 / float(self.info.frame_rate))
+        return float(off.max(initial=0.0)) > TIME_ROUNDING
+
+    @property
+    def usual_interval(self) -> float:
+        """Seconds from one selected frame to the next in the mean, or, where it varies, as a rule.
+
+        See `usual_step`.
+        """
+        if not self.varies:
+            return self._stride / float(self.info.frame_rate)
+        return self._stride * usual_step(self._steps)
+
     def varying_rate(self) -> str | None:
         """A line about frames that are not shown for equally long; None: they are."""
-        steps = np.diff([] if self._is_even else self.frame_times() or [])
-        mean = 1 / float(self.info.frame_rate)
+        steps, mean = self._steps, 1 / float(self.info.frame_rate)
         if not len(steps) or np.ptp(steps) < 0.5 * mean:
             return None
-        shortest, longest, mean = (f"{1000 * t:.0f}" for t in (steps.min(), steps.max(), mean))
+        shortest, longest = (f"{1000 * t:.0f}" for t in (steps.min(), steps.max()))
         return (
-            f"frames are shown for {shortest} to {longest} ms (variable frame rate): motion is "
-            f"expected as in {mean} ms, the mean, in each; the track has the frames' own times"
+            f"frames are shown for {shortest} to {longest} ms (variable frame rate): each is taken "
+            "at its own time"
         )
 
     def _shown_at(self) -> list[float | None]:
@@ -250,7 +277,6 @@ class VideoReader:
                     raise self._not_a_video("it holds no pictures")
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate or stream.base_rate
-                self._is_even = stream.average_rate in (None, stream.base_rate)
                 num_frames = stream.frames or None
                 duration = (stream.duration or 0) * (stream.time_base or 0) * (rate or 0)
                 if num_frames and duration and "mp4" in container.format.name:
@@ -413,15 +439,20 @@ class VideoWriter:
         if not 0 < frame_rate < 1e6:
             raise ConfigurationError(f"frames per second must be positive, got {frame_rate}")
         self.num_frames = 0
-        self._rate = Fraction(frame_rate).limit_denominator(65535)
+        self._rate = self._ticks = Fraction(frame_rate).limit_denominator(65535)
         self._crf = crf
         self._partial = temporary_name(self.path)
         self._size_hw: tuple[int, int] | None = None
         self._container: Any = None
         self._stream: Any = None
 
-    def write(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+    def write(self, image: UInt8[np.ndarray, "h w 3"], time_s: float | None = None) -> None:
         """Append one frame, red, green, blue.
+
+        Args:
+            image: The frame.
+            time_s: When it is shown, seconds, after the one before; of all frames or of none. None:
+                as many frames come a second as the film says.
 
         Raises:
             ShapeError: If it is not an 8-bit colour image of the first frame's size.
@@ -443,9 +474,11 @@ class VideoWriter:
         try:
             if self._size_hw is None:
                 self._size_hw = (height, width)
+                if time_s is not None:
+                    self._ticks = Fraction(_TICKS)
                 self._open(image.shape[1], image.shape[0])
             picture = VideoFrame.from_ndarray(image, format="rgb24")
-            picture.pts = self.num_frames
+            picture.pts = self.num_frames if time_s is None else round(time_s * self._ticks)
             self._container.mux(self._stream.encode(picture))
         except _av_errors() as error:
             raise output_error(self.path, error) from error
@@ -462,7 +495,7 @@ class VideoWriter:
         self._container = av.open(f"file:{self._partial}", "w", options=options)
         stream = self._container.add_stream("libx264", rate=self._rate)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.time_base = stream.codec_context.time_base = 1 / self._rate
+        stream.time_base = stream.codec_context.time_base = 1 / self._ticks
         stream.gop_size = max(1, round(_SECONDS_BETWEEN_KEY_FRAMES * self._rate))
         stream.options = {"crf": str(self._crf), "preset": "veryfast"}
         self._stream = stream
@@ -509,6 +542,16 @@ class VideoWriter:
         # The first error is the one to report; a full disk will refuse the closing too.
         with suppress(OSError):
             self.close()
+
+
+def usual_step(steps: Float[np.ndarray, " t"]) -> float:
+    """Mean of the intervals that differ from their median by no more than their rounding.
+
+    Args:
+        steps: Seconds from each frame to the next.
+    """
+    usual = np.quantile(steps, 0.5, method="lower")  # one of them
+    return float(steps[np.abs(steps - usual) < 1.5 * TIME_ROUNDING].mean())
 
 
 def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:

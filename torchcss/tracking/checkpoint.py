@@ -51,6 +51,7 @@ def state_tensors(state: SessionState) -> dict[str, Tensor]:
         for number, window in enumerate(windows):
             if window is not None:
                 tensors[f"windows.{index}.{number}"] = torch.tensor(window)
+    tensors["times"] = torch.tensor(state.times, dtype=torch.float64)
     if state.monitor is not None:
         history, excess, total, score = state.monitor
         for name, costs in history.items():
@@ -111,6 +112,7 @@ def state_from_tensors(tensors: Mapping[str, Tensor], body: BodyModel) -> Sessio
                 tuple(_window(tensors, index, number) for number in range(len(seen)))
                 for index in range(2)
             ),
+            times=tuple(tensors.get("times", torch.empty(0)).tolist()),
         )
     except (KeyError, RuntimeError, TypeError, AssertionError) as error:
         raise TrackFileError(

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +63,7 @@ from torchcss.tracking.view import (
     ViewMemory,
     ViewObservation,
 )
-from torchcss.types import Bounds, Frame
+from torchcss.types import TIME_ROUNDING, Bounds, Frame
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
 
@@ -151,6 +151,7 @@ class SessionState(NamedTuple):
         monitor: What tells a loss; None where nothing does.
         num_lost: Frames in a row that counted as lost, up to the last.
         windows: Where each view is looked at, in the next frame and in the one after it.
+        times: Seconds at which the last two frames were shown, or as many as there were.
     """
 
     tracker: TrackerState
@@ -160,6 +161,7 @@ class SessionState(NamedTuple):
     monitor: MonitorState | None
     num_lost: int = 0
     windows: tuple[ViewWindows, ...] = ()
+    times: tuple[float, ...] = ()
 
 
 class TrackingSession:
@@ -169,7 +171,9 @@ class TrackingSession:
         settings: How to track.
         first: Where the body may be in the first frame, and the body.
         views: The cameras that look on, with their keypoints where there are any.
-        frame_interval: Seconds between frames, which scales the expected motion.
+        frame_interval: Seconds between frames as a rule, which scales the expected motion. A frame
+            that comes later or earlier by its own time (`Frame.time_s`) is expected to have moved
+            by more or less (`torchcss.inference.dynamics`), the temporal priors with it.
         generator: Source of the samples; None: one seeded with `settings.seed`.
         plan: The parts of the session, for studies that exchange some; None: what `make_plan` makes
             of the settings.
@@ -241,6 +245,7 @@ class TrackingSession:
         """Be ready to see the frame that follows a state."""
         self._seen, self._num_seen = state.seen, int(state.tracker.frame)
         self._ahead = deque(state.windows, maxlen=2)
+        self._times = deque(state.times, maxlen=2)
 
     def _windows(self, body: BodyModel, mixture: GaussianMixture) -> ViewWindows:
         """Where each view is looked at two frames later."""
@@ -318,9 +323,14 @@ class TrackingSession:
             pairs = zip_longest(given, self._observers)
             frames = [self._placed(image, observer) for image, observer in pairs]
             self._num_seen += 1
-            windows: ViewWindows = (None,) * len(frames)
-            if self._ahead:
-                windows = self._ahead.popleft()
+            everywhere: ViewWindows = (None,) * len(frames)
+            windows = self._ahead.popleft() if self._ahead else everywhere
+            assert frames[0] is not None
+            times = (*self._times, frames[0].time_s)
+            # Windows are for two intervals: what comes later may be beyond them.
+            if sum(self._intervals(*pair) for pair in pairwise(times)) > 2.5:
+                windows = everywhere
+            self._times.append(times[-1])
             self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
             return Observation(self._seen, time.perf_counter() - began)
 
@@ -346,6 +356,16 @@ class TrackingSession:
         index = self._num_seen
         return Frame(index + observer.view.offset, index * self.plan.frame_interval, image)
 
+    def _intervals(self, *times: float) -> float:
+        """How many usual intervals go from one frame to the next.
+
+        One where that is so but for the rounding of times in a container, where times do not rise,
+        which then say nothing, and before the first frame.
+        """
+        usual, between = self.plan.frame_interval, times[-1] - times[0]
+        rounding = min(TIME_ROUNDING, usual / 2)
+        return between / usual if between > 0 and abs(between - usual) > rounding else 1.0
+
     def step(
         self,
         observation: Observation,
@@ -365,14 +385,15 @@ class TrackingSession:
         self, observation: Observation, searched: Callable[[TrackingCost], TrackingCost]
     ) -> Posterior:
         before, plan, stopwatch = self.state, self.plan, Stopwatch()
+        intervals = self._intervals(*before.times[-1:], observation.frame.time_s)
         body, clock = before.body, [time.perf_counter()]
         memory = tuple(
             observer.recall(known, seen)
             for observer, known, seen in self._of_views(before.memory, observation)
         )
-        cost = self._cost(observation, memory, stopwatch)
+        cost = self._cost(observation, memory, stopwatch, intervals)
         clock.append(time.perf_counter())
-        tracker, cost = self._tracker(observation, cost), searched(cost)
+        tracker, cost = self._tracker(observation, cost, intervals), searched(cost)
         after, info = tracker.step(before.tracker, cost.problem(), self._bounds)
         clock.append(time.perf_counter())
         term_seconds, modes = dict(stopwatch.seconds), after.mixture
@@ -386,11 +407,12 @@ class TrackingSession:
             )
             windows = self._windows(body, modes)
         self._ahead.append(windows)
-        next_body, moved = follow_with_base(body, after)
+        next_body, moved = follow_with_base(body, after.per_interval(intervals))
         self.state = SessionState(
             *(moved, next_body, observation.views, memory, monitor),
             num_lost=before.num_lost + 1 if lost else 0,
             windows=(*before.windows[1:], windows),
+            times=(*before.times, observation.frame.time_s)[-2:],
         )
         return Posterior(
             frame=observation.frame,
@@ -431,13 +453,14 @@ class TrackingSession:
         observation: Observation,
         memory: Sequence[ViewMemory],
         stopwatch: Stopwatch,
+        intervals: float,
     ) -> TrackingCost:
         """The cost of a frame, for samples of the modes before."""
         before = self.state.tracker
         keypoints = not self.plan.keypoints_first_only or int(before.frame) == 0
         return beside(
             [
-                observer.cost(
+                (observer if intervals == 1 else observer.over(intervals)).cost(
                     seen,
                     known,
                     self.state.body,
@@ -449,7 +472,9 @@ class TrackingSession:
             ]
         )
 
-    def _tracker(self, observation: Observation, cost: TrackingCost) -> SequenceTracker:
+    def _tracker(
+        self, observation: Observation, cost: TrackingCost, intervals: float
+    ) -> SequenceTracker:
         """The tracker of a frame: wider after a loss, with the moves and dynamics that it asks for.
 
         Particle filters have neither: they search by the noise of their own dynamics. Nor has a
@@ -457,6 +482,7 @@ class TrackingSession:
         """
         plan, state = self.plan, self.state
         tracker, recovery = plan.tracker, plan.recovery
+        tracker = tracker if intervals == 1 else tracker.over(intervals)
         lost = recovery is not None and 0 < state.num_lost <= recovery.patience
         if recovery is not None and lost:
             tracker = recovery.widened(tracker)
@@ -483,6 +509,7 @@ class TrackingSession:
                 body=state.body,
                 pairs=pairs,
                 deviation=cost.views[0].deviation,
+                intervals=intervals,
             )
         return replace(tracker, proposal=with_moves(search, moves, num), dynamics=dynamics)
 

@@ -20,6 +20,7 @@ tracker.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -117,7 +118,7 @@ class SurfaceMotion:
             body: The body on this frame's base.
             pairs: What each camera has seen.
             before: The modes of the frame before.
-            velocity: How far each moved into that frame.
+            velocity: How far each goes on if it moves as it did into that frame.
             expected: Where they are expected in this frame.
             deviation: Motion expected in a frame; None: not known.
 
@@ -178,6 +179,7 @@ class SurfaceDynamics:
         body: The body on this frame's base.
         pairs: What each camera has seen.
         deviation: Motion expected in a frame; None: not known.
+        intervals: How many usual intervals it comes after the one before it.
     """
 
     dynamics: Dynamics
@@ -185,20 +187,28 @@ class SurfaceDynamics:
     body: BodyModel
     pairs: Sequence[PicturePair]
     deviation: Vector | None
+    intervals: float = 1.0
+
+    def over(self, intervals: float) -> SurfaceDynamics:
+        """See `Dynamics.over`."""
+        wider = None if self.deviation is None else math.sqrt(intervals) * self.deviation
+        return replace(
+            self, dynamics=self.dynamics.over(intervals), deviation=wider, intervals=intervals
+        )
 
     def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Return the prior of the next frame.
 
         Args:
             mixture: Posterior of this frame.
-            velocity: How far each mode moved since the last frame.
+            velocity: How far each mode moved in the last interval.
         """
         spread = self.dynamics.predict(mixture, velocity)
         mean = self.motion(
             self.body,
             self.pairs,
             before=mixture.mean,
-            velocity=velocity,
+            velocity=self.intervals * velocity,
             expected=spread.mean,
             deviation=self.deviation,
         )

@@ -12,6 +12,7 @@ back.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -94,6 +95,10 @@ class Observer:
     extractor: FeatureExtractor
     relative_noise: float = 1.0
     contrast: bool = False
+
+    def over(self, intervals: float) -> Observer:
+        """The same for a frame that comes so many intervals after the one before it."""
+        return replace(self, costs=self.costs.over(intervals))
 
     def observe(
         self, frame: Frame | None, before: ViewObservation, window: Window | None = None

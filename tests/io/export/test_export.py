@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,7 +142,23 @@ def test_rates(track: Track):
     rough = select(track._replace(times=np.array([0.0, 0.04, 0.08, 0.2])))
     assert rough.rate == pytest.approx(25.0)
     assert any("not evenly spaced" in line for line in rough.report)
+    rounded = track._replace(times=np.array([0.0, 0.033, 0.067, 0.1]))  # milliseconds
+    assert select(rounded).rate == pytest.approx(30.0)
+    assert not any("evenly" in line for line in select(rounded).report)
     assert select(track, SelectionChoice(stop=5)).rate == 60.0
+
+
+@pytest.mark.parametrize("to", ["trc", "mot", "csv", "angles"])
+def test_columns_of_times_have_each_frames_own(track: Track, tmp_path: Path, to: str):
+    times = np.array([0.0, 0.04, 0.12, 0.2])
+    save_track(tmp_path / "track.npz", track._replace(times=times))
+    paths, report = export_as(tmp_path, to=to)
+    rows = [re.split(r"[,\t]", line.strip()) for line in paths[0].read_text().splitlines()]
+    (head,) = [row for row in rows if "time" in (name.lower() for name in row)]
+    column = [name.lower() for name in head].index("time")
+    found = {float(row[column]) for row in rows[rows.index(head) + 1 :] if row[0][:1].isdigit()}
+    assert sorted(found) == pytest.approx(times)
+    assert any("not evenly spaced in time (40.0 to 80.0 ms)" in line for line in report)
 
 
 def test_the_rate_of_a_track_of_one_frame(tmp_path: Path):

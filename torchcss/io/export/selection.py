@@ -26,7 +26,8 @@ from jaxtyping import Float, Int
 from torchcss.body.uncertainty import Held
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.tracks import Track
-from torchcss.io.video import VideoReader
+from torchcss.io.video import VideoReader, usual_step
+from torchcss.types import TIME_ROUNDING
 from torchcss.vision.camera import Camera
 
 DEFAULT_FRAME_RATE = 25.0
@@ -312,14 +313,14 @@ def _rate(track: Track, kept: np.ndarray, report: list[str]) -> float:
             rate, said = DEFAULT_FRAME_RATE, "neither the track nor a video tells one"
         report.append(f"a frame rate of {rate:g} is written: {said}")
         return rate
-    step = float(np.median(steps))
-    if (np.abs(steps - step) > 0.01 * step).any():
+    step = float(times[-1] - times[0]) / len(steps)
+    if (np.abs(steps - step) > max(TIME_ROUNDING, 0.01 * step)).any():
+        step = usual_step(steps)
         report.append(
             f"the frames are not evenly spaced in time ({1000 * steps.min():.1f} to "
-            f"{1000 * steps.max():.1f} ms); their median is written"
+            f"{1000 * steps.max():.1f} ms): columns of times have each one's own, a single frame "
+            f"rate is that of {1000 * step:.1f} ms"
         )
-    else:
-        step = float(times[-1] - times[0]) / len(steps)
     rate = 1.0 / step
     return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate
 
