@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from torchcss.body.rotations import about
 from torchcss.errors import CameraError
@@ -526,6 +527,76 @@ def test_qualisys(tmp_path: Path, shown: bool) -> None:
     assert "viewrotation '90'" in str(load_camera(path).units_note)
     path.write_text(QUALISYS.format(parts=parts.replace("r33", "r34"), turned=0))
     with pytest.raises(CameraError, match="camera '26580': not Qualisys'"):
+        load_camera(path)
+
+
+VICON = """<?xml version="1.0" encoding="utf-8"?><Cameras>
+<Camera DEVICEID="2100001" DISPLAY_TYPE="Vicon Vantage V5" SENSOR_SIZE="2432 2048" {more}>
+<KeyFrames><KeyFrame FRAME="0"/></KeyFrames></Camera>
+<Camera DEVICEID="2107343" DISPLAY_TYPE="Vicon Vue 2" SENSOR_SIZE="640 480" {more}><KeyFrames>
+<KeyFrame FOCAL_LENGTH="600" FRAME="0" IMAGE_ERROR="0.2" ORIENTATION="{turn}" POSITION="{place}"
+PRINCIPAL_POINT="317.5 243" VICON_RADIAL="{k1} {k2}" {radial} WORLD_ERROR="0.4"/>
+</KeyFrames></Camera><Camera DEVICEID="7" TYPE="video" SENSOR_SIZE="640 480"/></Cameras>"""
+
+
+@pytest.mark.parametrize("k3", [None, 4e-18])
+def test_vicon(tmp_path: Path, k3: float | None) -> None:
+    """Its polynomial undoes the distortion, by pixels from a middle of its own."""
+    k1, k2, middle = 2.0e-7, -3e-13, np.array([319.0, 240.0]) if k3 else np.array([317.5, 243])
+    angle, axis, centre = 0.8, np.array([2.0, -1, 2]) / 3, np.array([1500.0, -2800, 1200])
+    turn = [*np.sin(angle / 2) * axis, np.cos(angle / 2)]
+    given = {
+        "k1": k1, "k2": k2, "turn": " ".join(map(str, turn)), "place": " ".join(map(str, centre)),
+        "more": 'PIXEL_ASPECT_RATIO="1" SKEW="0" USERID="1"',
+        "radial": f'VICON_RADIAL2="Vicon3Parameter 319 240 {k1} {k2} {k3}"' if k3 else "",
+    }  # fmt: skip
+    path = tmp_path / "a.xcp"
+    path.write_text(VICON.format(**given))
+    assert list(read_entries(path)) == ["2107343"]
+    loaded = load_camera(path)
+    camera = loaded.camera
+    assert loaded.metric
+    assert camera.image_size_wh == SIZE
+    np.testing.assert_allclose(camera.K, [[600, 0, 317.5], [0, 600, 243], [0, 0, 1]])
+    np.testing.assert_allclose(camera.centre_world, 0.001 * centre)
+    a, b, c = axis
+    cross = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
+    R = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    np.testing.assert_allclose(camera.R_camera_world, R, atol=1e-12)
+    seen = np.array([[10.0, 20], [630, 40], [300, 470], [40, 400], [320, 240]])
+    r2 = ((seen - middle) ** 2).sum(-1, keepdims=True)
+    straight = middle + (seen - middle) * (1 + k1 * r2 + k2 * r2**2 + (k3 or 0) * r2**3)
+    assert np.abs(straight - seen).max() > 5
+    rays = np.column_stack([(straight - [317.5, 243]) / 600, np.ones(5)])
+    points = torch.from_numpy((rays @ R) + 0.001 * centre)
+    np.testing.assert_allclose(camera.project(points).uv, seen, atol=0.05)
+
+
+def test_a_film_called_by_its_cameras_serial_number(tmp_path: Path) -> None:
+    given = {"k1": 0, "k2": 0, "turn": "0 0 0 1", "place": "0 0 0", "more": "", "radial": ""}
+    text = VICON.format(**given)
+    camera = text[text.index('<Camera DEVICEID="2107343"') : text.index('<Camera DEVICEID="7"')]
+    other = camera.replace("2107343", "2107344").replace("600", "700")
+    (tmp_path / "a.xcp").write_text(text.replace(camera, camera + other))
+    for number, focal in (("2107343", 600), ("2107344", 700)):
+        film = tmp_path / f"Walk01.{number}.20240102150405.avi"
+        assert load_camera(tmp_path / "a.xcp", video=film).camera.K[0, 0] == focal
+
+
+def test_vicon_cameras_that_cannot_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.xcp"
+    given = {"k1": 1e-3, "k2": 0, "turn": "0 0 0 1", "place": "0 0 0", "more": "", "radial": ""}
+    path.write_text(VICON.format(**given))
+    with pytest.raises(CameraError, match="its distortion is no lens's"):
+        load_camera(path)
+    path.write_text(VICON.format(**{**given, "k1": 0, "turn": "none"}))
+    with pytest.raises(CameraError, match="camera '2107343': not Vicon's"):
+        load_camera(path)
+    path.write_text("<Cameras><Camera DEVICEID='1'/></Cameras>")
+    with pytest.raises(CameraError, match="no camera of these is calibrated"):
+        load_camera(path)
+    path.write_text("<!DOCTYPE a [<!ENTITY b 'c'>]><Cameras>&b;</Cameras>")
+    with pytest.raises(CameraError, match=r"a\.xcp"):
         load_camera(path)
 
 

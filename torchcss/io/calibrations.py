@@ -11,7 +11,7 @@
 | Kalibr | YAML: `cam0` with `intrinsics` |
 | COLMAP | `cameras.txt` or `cameras.bin`, or their folder; `images` beside say places |
 | KITTI, ROS | `.txt`: numbers below or behind what they are |
-| Qualisys | `.qca.txt` |
+| Qualisys, Vicon | `.qca.txt`, `.xcp` |
 | MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
 | arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone; of several cameras |
 
@@ -161,9 +161,14 @@ _OTHERS = {
     ".sfm .abc": "Meshroom's; give K, image_size_wh and distortion in a cameras.json",
     ".pickle .pkl": "a pickle, from which code may run: not read; save K, dist, R and t with "
     "numpy.savez",
-    ".xcp": "the calibration of a motion capture system; save it as Pose2Sim's Calib.toml",
 }
 """Files of other kinds by how their names end, and what to do."""
+
+_KINDS_OF_VICON = names_in("TYPE DISPLAY_TYPE SYSTEM")
+"""Where it says whether a camera films or sees markers alone."""
+
+_MOST_OFF = 1.0
+"""Pixels by which Vicon's distortion, as ours, may be off in a corner."""
 
 _COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1",
@@ -206,7 +211,7 @@ def _read_folder(path: Path) -> dict[str, Entry]:
     places = [path / n for n in (INTRINSICS, *_OF_COLMAP)]
     places += [path / inner / n for inner in ("sparse/0", "0", "sparse") for n in _OF_COLMAP]
     files = [place for place in places if place.is_file()][:1]
-    kinds = iter((".xml", ".toml", ".yaml", ".yml", ".json", ".npz", ".npy", ".txt"))
+    kinds = iter((".xml", ".toml", ".yaml", ".yml", ".json", ".npz", ".npy", ".txt", ".xcp"))
     while not files and (suffix := next(kinds, None)) is not None:
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() == suffix]
     if not files:
@@ -929,6 +934,70 @@ def _read_qualisys(path: Path) -> dict[str, Entry]:
     return entries
 
 
+def _read_vicon(path: Path) -> dict[str, Entry]:
+    """Vicon's cameras by device number, of its video cameras if it has some.
+
+    It has millimetres; a camera's axes are ours, its orientation `x y z w` turns the world's into
+    them, its position is in the world.
+    """
+    cameras = parse_xml(path, "Vicon's XML", CameraError).findall("Camera")
+    found = [each for each in cameras if each.find("KeyFrames/KeyFrame") is not None]
+    kinds = [" ".join(each.get(word, "") for word in _KINDS_OF_VICON).lower() for each in found]
+    films = [each for each, kind in zip(found, kinds, strict=True) if re.search("video|vue", kind)]
+    entries: dict[str, Entry] = {}
+    for camera in films or found:
+        name = camera.get("DEVICEID", str(len(entries)))
+        frame = camera.find("KeyFrames/KeyFrame")
+        assert frame is not None
+        with refusing(CameraError, f"{path}: camera {name!r}: not Vicon's"):
+            size, centre, place, turn = (
+                np.array([float(number) for number in given.attrib[word].split()])
+                for given, word in (
+                    (camera, "SENSOR_SIZE"), (frame, "PRINCIPAL_POINT"), (frame, "POSITION"),
+                    (frame, "ORIENTATION"),
+                )
+            )  # fmt: skip
+            fx = float(frame.attrib["FOCAL_LENGTH"])
+            focal = np.array([fx, fx / float(camera.get("PIXEL_ASPECT_RATIO", 1))])
+            R = from_quaternion(turn[[3, 0, 1, 2]] / np.linalg.norm(turn))
+            lens = _vicon_lens(frame.attrib, focal, centre, size)
+            t = (-R @ place).tolist()
+            K = [*focal.tolist(), *centre.tolist()]
+            entries[name] = Entry(K, size.tolist(), lens, R.tolist(), t, "mm")
+    if not entries:
+        raise CameraError(f"{path}: no camera of these is calibrated; calibrate in Vicon's program")
+    return entries
+
+
+def _vicon_lens(
+    frame: Mapping[str, str], focal: np.ndarray, centre: np.ndarray, size: np.ndarray
+) -> list[float]:
+    """Vicon's polynomial, which undoes a distortion, as the coefficients that make it.
+
+    In pixels from its middle a point at d is straight at `d (1 + k1 d^2 + k2 d^4 + k3 d^6)`.
+    """
+    given = frame.get("VICON_RADIAL2", "").split()[1:]
+    middle, undoing = given[:2] or centre, given[2:] or frame.get("VICON_RADIAL", "0").split()
+    middle, undoing = (np.array([*map(float, numbers)]) for numbers in (middle, undoing))
+    steps = (np.linspace(0.0, side - 1, 41) for side in size)
+    seen = np.stack(np.meshgrid(*steps), -1).reshape(-1, 2)
+    away = seen - middle
+    r2 = (away * away).sum(-1, keepdims=True)
+    straight = middle + away * (1 + sum(k * r2 ** (n + 1) for n, k in enumerate(undoing)))
+    a, b = np.moveaxis((straight - centre) / focal, -1, 0)
+    r2 = a * a + b * b
+    columns = [
+        [a * r2, b * r2], [a * r2**2, b * r2**2], [2 * a * b, r2 + 2 * b * b],
+        [r2 + 2 * a * a, 2 * a * b], [a * r2**3, b * r2**3],
+    ]  # fmt: skip
+    made = np.stack([np.stack(each, -1) for each in columns], -1) * focal[:, None]
+    lens = np.linalg.lstsq(made.reshape(-1, 5), (seen - straight).reshape(-1), rcond=None)[0]
+    off = float(np.abs(made @ lens - (seen - straight)).max())
+    if off > _MOST_OFF:
+        raise CameraError(f"its distortion is no lens's that is known ({off:.1f} pixels off)")
+    return lens.tolist()
+
+
 def _read_arrays(path: Path) -> dict[str, Entry]:
     """Arrays by the usual words, or K or P alone."""
     if path.suffix.lower() == ".npy":
@@ -1005,5 +1074,6 @@ _READERS = {
     **dict.fromkeys((".txt", ".csv"), _read_text),
     **dict.fromkeys((".npy", ".npz"), _read_arrays),
     **{".bin": _read_binary, ".mat": _read_matlab, ".toml": _read_toml, ".xml": _read_xml},
+    ".xcp": _read_vicon,
 }
 """By the suffix; everything else is JSON."""

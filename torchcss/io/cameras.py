@@ -388,7 +388,10 @@ def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: P
         for name, entry in entries.items()
         if entry.is_picture and _letters(video.stem) in map(_letters, _stems(name))
     ]
-    for found in (exact, alike, pictures):
+    # Motion capture systems call a film by its camera's serial number, among other things.
+    numbers = re.findall("[0-9]{5,}", video.stem)
+    serial = [name for name in cameras if name in numbers]
+    for found in (exact, alike, serial, pictures):
         if len(found) == 1:
             return found[0]
     if alone is not None:
