@@ -16,6 +16,7 @@ from torchcss.body.rotations import about
 from torchcss.errors import CameraError
 from torchcss.io.calibrations import read_entries
 from torchcss.io.cameras import load_camera, load_lens, read_cameras
+from torchcss.io.lenses import Mirror
 from torchcss.io.video import VideoWriter
 
 SIZE = (640, 480)
@@ -646,7 +647,7 @@ def test_sizes_by_any_usual_name(tmp_path: Path, size: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "model",
     [{"model": "fisheye"}, {"camera_model": "OPENCV_FISHEYE"}, {"distortion_type": "KannalaBrandt"},
-     {"camera_model": "omni", "distortion_model": "radtan"}, {"fisheye_model": 1}, {"xi": 1.2},
+     {"camera_model": "omni", "distortion_model": "radtan"}, {"fisheye_model": 1},
      {"distortion": {"model": "fisheye", "coefficients": [0.1, 0, 0, 0]}, "D": None},
      {"MappingCoefficients": [8e2, -1e-3, 1e-7, 1e-10]}],
 )  # fmt: skip
@@ -733,6 +734,74 @@ def test_fisheye_lenses_by_the_formula_of_opencv(tmp_path: Path, kind: str) -> N
     np.testing.assert_allclose(lens.K, K)
     np.testing.assert_allclose(lens.coefficients, FISHEYE)
     assert not loaded.camera.has_distortion
+    assert loaded.camera.image_size_wh == SIZE
+
+
+INTRINSICS = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
+PINHOLES = [FX, FY, CX, CY]
+RADTAN, COEFFICIENTS = LENS[:4], ("k1", "k2", "p1", "p2")
+MIRROR_FILES: dict[str, tuple[str, Any, Mirror, list[float]]] = {
+    "Kalibr, omni": (
+        "camchain.yaml",
+        {"cam0": {"camera_model": "omni", "intrinsics": [1.2, *PINHOLES], "resolution": SIZE,
+                  "distortion_model": "radtan", "distortion_coeffs": RADTAN}},
+        Mirror("omni", (1.2,)), RADTAN,
+    ),
+    "Kalibr, ds": (
+        "camchain.yaml",
+        {"cam0": {"camera_model": "ds", "intrinsics": [-0.2, 0.6, *PINHOLES], "resolution": SIZE,
+                  "distortion_model": "none", "distortion_coeffs": []}},
+        Mirror("ds", (-0.2, 0.6)), [],
+    ),
+    "Kalibr, eucm": (
+        "camchain.yaml",
+        {"cam0": {"camera_model": "eucm", "intrinsics": [0.6, 1.1, *PINHOLES],
+                  "distortion_model": "none", "distortion_coeffs": [], "resolution": SIZE}},
+        Mirror("eucm", (0.6, 1.1)), [],
+    ),
+    "cv2.omnidir": (
+        "a.yml",
+        OPENCV + yaml_matrix("camera_matrix", K, 3) + yaml_matrix("xi", [1.2], 1)
+        + yaml_matrix("distortion_coefficients", RADTAN, 1),
+        Mirror("omni", (1.2,)), RADTAN,
+    ),
+    "camodocal": (
+        "a.yaml",
+        "%YAML:1.0\n---\nmodel_type: MEI\ncamera_name: a\n" + SIZES
+        + "mirror_parameters:\n   xi: 1.2\ndistortion_parameters:\n"
+        + "".join(f"   {n}: {v}\n" for n, v in zip(COEFFICIENTS, RADTAN, strict=True))
+        + f"projection_parameters:\n   gamma1: {FX}\n   gamma2: {FY}\n   u0: {CX}\n   v0: {CY}\n",
+        Mirror("omni", (1.2,)), RADTAN,
+    ),
+    "Basalt, ds": (
+        "a.json",
+        {"cameras": [{"name": "a", "camera_type": "ds", "resolution": SIZE,
+                      "intrinsics": {**INTRINSICS, "xi": -0.2, "alpha": 0.6}}]},
+        Mirror("ds", (-0.2, 0.6)), [],
+    ),
+    "Basalt, ucm": (
+        "a.json",
+        {"cameras": [{"name": "a", "camera_type": "ucm", "resolution": SIZE,
+                      "intrinsics": {**INTRINSICS, "alpha": 0.6}}]},
+        Mirror("eucm", (0.6, 1.0)), [],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", MIRROR_FILES)
+def test_omnidirectional_lenses(tmp_path: Path, kind: str) -> None:
+    """As fisheye lenses: made straight, not tracked as they are."""
+    name, content, mirror, coefficients = MIRROR_FILES[kind]
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    refusal = rf"an omnidirectional lens \({mirror.model}\) is not supported: torchcss undistort"
+    with pytest.raises(CameraError, match=refusal):
+        load_camera(path)
+    loaded, lens = load_lens(path)
+    assert (lens.mirror, lens.is_fisheye) == (mirror, False)
+    np.testing.assert_allclose(lens.K, K)
+    np.testing.assert_allclose(lens.coefficients[: len(coefficients)], coefficients)
+    assert not np.any(lens.coefficients[len(coefficients) :])
     assert loaded.camera.image_size_wh == SIZE
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchcss.errors import CameraError
-from torchcss.io.lenses import Lens, straight_image
+from torchcss.io.lenses import Lens, Mirror, straight_image
 
 K = np.array([[611.25, 0.0, 317.5], [0.0, 612.75, 243.0], [0.0, 0.0, 1.0]])
 SIZE = (640, 480)
@@ -55,6 +55,48 @@ def test_a_fisheye_lens_of_no_coefficients_keeps_angles() -> None:
     for angle in (0.1, 0.7, 1.3):
         (u, _) = lens.pixels(np.array([math.tan(angle), 0.0]))
         assert u == pytest.approx(317.5 + 611.25 * angle)
+
+
+def seen_by_spheres(x: float, y: float, z: float, model: Mirror) -> tuple[float, float]:
+    """The papers' own steps: onto one sphere or two, or an ellipsoid, and from there."""
+    if model.model == "eucm":
+        alpha, beta = model.parameters
+        depth = alpha * math.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
+        return x / depth, y / depth
+    xi = model.parameters[0]
+    if model.model == "omni":
+        length = math.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        return x / (z + xi), y / (z + xi)
+    alpha = model.parameters[1]
+    d1 = math.sqrt(x * x + y * y + z * z)
+    d2 = math.sqrt(x * x + y * y + (xi * d1 + z) ** 2)
+    depth = alpha * d2 + (1 - alpha) * (xi * d1 + z)
+    return x / depth, y / depth
+
+
+@pytest.mark.parametrize(
+    "mirror",
+    [Mirror("omni", (1.3,)), Mirror("omni", (0.4,)), Mirror("ds", (-0.2, 0.59)),
+     Mirror("ds", (0.1, 0.4)), Mirror("eucm", (0.6, 1.1)), Mirror("eucm", (0.4, 0.9))],
+)  # fmt: skip
+def test_mirrors_are_those_of_the_papers_and_lead_back(mirror: Mirror) -> None:
+    lens = Lens(K, (0.05, -0.02, 0.001, -0.002), False, mirror)
+    places = np.array([*PLACES.tolist(), [-3.0, 2.0], [0.0, 0.0]])
+    pixels = lens.pixels(places)
+    for (x, y), pixel in zip(places, pixels, strict=True):
+        a, b = seen_by_spheres(2 * x, 2 * y, 2.0, mirror)
+        r2 = a * a + b * b
+        q = 1 + 0.05 * r2 - 0.02 * r2**2
+        bent = [a * q + 0.002 * a * b - 0.002 * (r2 + 2 * a * a),
+                b * q + 0.001 * (r2 + 2 * b * b) - 0.004 * a * b]  # fmt: skip
+        np.testing.assert_allclose(pixel, K[:2, :2] @ bent + K[:2, 2], atol=1e-9)
+    found, reached = lens.places(pixels)
+    assert reached.all()
+    np.testing.assert_allclose(found, places, atol=1e-9)
+    borders, reached = lens.places(np.array([[-1e4, 0.0], [0.0, 1e4]]))
+    assert np.isfinite(borders).all()
+    assert not reached.any()
 
 
 def test_beyond_its_turning_point_a_lens_shows_nothing() -> None:

@@ -56,6 +56,7 @@ from torchcss.files import (
 )
 from torchcss.io.keypoints.json_people import listed
 from torchcss.io.keypoints.words import SIDES, SIZES, first_of, plain_word
+from torchcss.io.lenses import MIRRORS, Mirror
 from torchcss.joint_names import names_in
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
@@ -74,7 +75,8 @@ class Entry(NamedTuple):
         units: Unit of the world and of pixels.
         video: Name of the video.
         fisheye: What a lens is that follows no pinhole's model: "equidistant" (k1 k2 k3 k4 of
-            OpenCV's fisheye lens are its distortion), "inverse", or True of another kind.
+            OpenCV's fisheye lens are its distortion), a `torchcss.io.lenses.Mirror` (before the
+            distortion), "inverse", or True of another kind.
         note: What was assumed, for the user.
         name: What the camera calls itself.
         is_picture: It is a camera where one of many pictures was taken, by that picture's name.
@@ -117,7 +119,7 @@ _DISTORTION = re.compile("(lens)?dist(?!ance)|(d|kc|coeffs|coefficients|dvec)$")
 
 _ONE_BY_ONE = (
     ("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"), ("mu", "mv", "u0", "v0"),
-    ("fl_x", "fl_y", "cx", "cy"),
+    ("gamma1", "gamma2", "u0", "v0"), ("fl_x", "fl_y", "cx", "cy"),
 )  # fmt: skip
 """What the numbers of K are called where each has a name; the last are Nerfstudio's."""
 
@@ -140,6 +142,13 @@ _OTHER = re.compile(
     "omni|ucm|fov|theta|prism_fish|scaramuzza|ocam|mei$|double|^ds$|^ds-|-ds$", re.IGNORECASE
 )
 """Models of lenses that are OpenCV's fisheye lens, and others that see as much."""
+
+_MIRRORS = {
+    "eucm": re.compile("ucm", re.IGNORECASE),
+    "ds": re.compile("double|^ds$|^ds-|-ds$", re.IGNORECASE),
+    "omni": re.compile("omni|mei$", re.IGNORECASE),
+}
+"""Models by which of `torchcss.io.lenses` they are."""
 
 _ROUNDING = 1e-3
 """Skew that is taken for rounding, in focal lengths."""
@@ -254,6 +263,8 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     models = [str(first_of(values, (word,))) for word in _MODELS]
     fisheye = _fisheye(values, models)
     lens, size, video = _lens(values, fisheye), _said_size(values), values.get("video")
+    if isinstance(fisheye, Mirror) and _shape(found["K"]) == (4 + len(fisheye.parameters),):
+        found["K"] = found["K"][len(fisheye.parameters) :]  # Kalibr has all in one
     if any(map(_INVERSE.search, models)) and np.any(np.array(lens, dtype=object)):
         fisheye = "inverse"
     notes = []
@@ -279,8 +290,10 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
     )
 
 
-def _fisheye(values: Mapping[str, Any], models: Sequence[str]) -> bool | str:
+def _fisheye(values: Mapping[str, Any], models: Sequence[str]) -> bool | str | Mirror:
     """Which lens that follows no pinhole's model: see `Entry`."""
+    if (mirror := _mirror(values, models)) is not None:
+        return mirror
     said = [str(first_of(values, words)).lower() for words in (_IS_FISHEYE, _IS_OTHER)]
     is_fisheye, is_other = (word not in ("none", "false", "0", "0.0") for word in said)
     if is_other or any(map(_OTHER.search, models)):
@@ -288,10 +301,25 @@ def _fisheye(values: Mapping[str, Any], models: Sequence[str]) -> bool | str:
     return "equidistant" if is_fisheye or any(map(_FISHEYE.search, models)) else False
 
 
+def _mirror(values: Mapping[str, Any], models: Sequence[str]) -> Mirror | None:
+    """A mirror with its numbers; None: it is none, or has none."""
+    kind = next((k for k, pattern in _MIRRORS.items() if any(map(pattern.search, models))), "omni")
+    ucm = {"beta": 1.0} if any(model.lower() == "ucm" for model in models) else {}
+    numbers = [{**ucm, **values}.get(word) for word in MIRRORS[kind]]
+    every = first_of(values, _WORDS["K"])
+    if None in numbers and _shape(every) == (4 + len(numbers),):
+        numbers = listed(every)[: len(numbers)]
+    with suppress(CameraError):
+        given = [real_numbers(_plain(each), "", CameraError).ravel() for each in numbers]
+        if all(each.size == 1 and np.isfinite(each).all() for each in given):
+            return Mirror(kind, tuple(float(each[0]) for each in given))
+    return None
+
+
 def _is_inner(word: str, value: Any) -> bool:
     """Whether intrinsics, extrinsics or coefficients are objects of their own."""
     plain = plain_word(word)
-    words = (*_WORDS["K"], *_POSES, "projectionparameters")
+    words = (*_WORDS["K"], *_POSES, "projectionparameters", "mirrorparameters")
     named = plain in words or bool(_DISTORTION.match(plain))
     return named and isinstance(value, Mapping) and "data" not in value
 

@@ -29,7 +29,7 @@ from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
 from torchcss.files import StrPath, real_numbers, shortened, unexpected
 from torchcss.io.calibrations import Entry, read_entries
-from torchcss.io.lenses import MOST_COEFFICIENTS, Lens
+from torchcss.io.lenses import MOST_COEFFICIENTS, Lens, Mirror
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera
 
@@ -144,7 +144,8 @@ def load_lens(
     coefficients = coefficients[:most]
     numbers = numbers._replace(distortion=np.zeros(4))
     _loaded(name, entry, numbers, path)  # which checks K
-    lens = Lens(numbers.K, tuple(coefficients.tolist()), is_fisheye)
+    mirror = entry.fisheye if isinstance(entry.fisheye, Mirror) else None
+    lens = Lens(numbers.K, tuple(coefficients.tolist()), is_fisheye, mirror)
     size = (int(numbers.size[0]), int(numbers.size[1]))
     straight = numbers._replace(K=lens.straightened_K(size, fov))
     return _loaded(name, entry, straight, path), lens
@@ -165,7 +166,7 @@ def _chosen(path: Path, name: str | None, video: StrPath | None) -> tuple[str, E
     entries = read_entries(path)
     name = _choose(path, entries, name, None if video is None else Path(video))
     entry = entries[name]
-    if entry.fisheye not in (False, "equidistant"):
+    if entry.fisheye not in (False, "equidistant") and not isinstance(entry.fisheye, Mirror):
         what = "an inverse model of a" if entry.fisheye == "inverse" else "this model of a fisheye"
         raise CameraError(
             f"{path}: camera {name!r}: {what} lens is not supported; undistort the video by the "
@@ -241,6 +242,8 @@ def _checked(entry: Entry, where: str) -> _Numbers:
 
 def _unlike_a_pinhole(distortion: np.ndarray, fisheye: object) -> str | None:
     """What a lens is that a camera does not follow; None: it does."""
+    if isinstance(fisheye, Mirror):
+        return f"an omnidirectional lens ({fisheye.model})"
     if fisheye:
         return "a fisheye lens"
     if distortion[5:].any():

@@ -14,6 +14,14 @@ and then the sensor's tilt, a projective map of (a', b') by the angles tx and ty
 
     (a', b') = (a, b) t / r (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)
 
+*Mirrors*: lenses of which the rational formula holds once (a, b) is divided by, with d^2 = r2 + 1,
+
+| | parameters | divisor | source |
+|---|---|---|---|
+| `omni` | xi | 1 + xi d | Mei and Rives 2007; `cv::omnidir`, Kalibr's omni, camodocal's MEI |
+| `ds` | xi, alpha | alpha e + (1 - alpha) g; g = 1 + xi d, e^2 = r2 + g^2 | Usenko et al. 2018 |
+| `eucm` | alpha, beta | alpha sqrt(1 + beta r2) + 1 - alpha | Khomutenko et al. 2016 |
+
 By default: `Lens.straightened_K`, then `Lens.straight_image` and `Lens.straight_pixels`.
 """
 
@@ -40,11 +48,55 @@ _WIDEST = math.radians(110)
 """Angle from left to right of a straight picture, unless it is asked for: beyond, whatever stands
 near the border is drawn out."""
 
+_LEAST = 1e-12
+"""Radius below which formulas are as at it."""
+
 _STEPS = 20
 """Newton steps of the inverse, which begins at the radial part's."""
 
 _SLOPE = 1e-6
 """Step of the differences that they use."""
+
+
+class Mirror(NamedTuple):
+    """A mirror or a lens that sees as much.
+
+    Attributes:
+        model: Which of the table above.
+        parameters: Its numbers.
+    """
+
+    model: str
+    parameters: tuple[float, ...]
+
+    def shrunk(self, r: np.ndarray) -> np.ndarray:
+        """How far from the axis is seen what is at r from it, at unit depth."""
+        d = np.hypot(r, 1.0)
+        if self.model == "eucm":
+            alpha, beta = self.parameters
+            return r / (alpha * np.sqrt(1 + beta * r * r) + 1 - alpha)
+        xi, alpha = (*self.parameters, 0.0)[:2]
+        g = 1 + xi * d
+        return r / (alpha * np.hypot(r, g) + (1 - alpha) * g)
+
+    def spread(self, m: np.ndarray) -> np.ndarray:
+        """What `shrunk` takes to m; infinite where that is behind the camera, or nothing."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            if self.model == "eucm":
+                alpha, beta = self.parameters
+                root = np.sqrt(1 - (2 * alpha - 1) * beta * m * m)
+                z = (1 - beta * alpha**2 * m * m) / (alpha * root + 1 - alpha)
+                return np.where(z > 0, m / z, np.inf)
+            xi, alpha = (*self.parameters, 0.0)[:2]
+            root = np.sqrt(1 - (2 * alpha - 1) * m * m)
+            z = (1 - alpha**2 * m * m) / (alpha * root + 1 - alpha)
+            scale = (z * xi + np.sqrt(z * z + (1 - xi * xi) * m * m)) / (z * z + m * m)
+            depth = scale * z - xi
+            return np.where(depth > 0, scale * m / depth, np.inf)
+
+
+MIRRORS = {"omni": ("xi",), "ds": ("xi", "alpha"), "eucm": ("alpha", "beta")}
+"""What the numbers of each model are called."""
 
 
 class Lens(NamedTuple):
@@ -54,11 +106,13 @@ class Lens(NamedTuple):
         K: Intrinsic matrix; pixel centres at integers.
         coefficients: OpenCV's, in its order; those behind the last are zero.
         is_fisheye: Which of the two formulas holds.
+        mirror: What comes before the rational one; None: nothing.
     """
 
     K: Float[np.ndarray, "3 3"]
     coefficients: tuple[float, ...]
     is_fisheye: bool
+    mirror: Mirror | None = None
 
     def pixels(self, places: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b 2"]:
         """Where points at unit depth are seen; NaN where the formula means nothing.
@@ -67,10 +121,10 @@ class Lens(NamedTuple):
             places: (a, b) of each.
         """
         radius = np.linalg.norm(places, axis=-1, keepdims=True)
-        if self.is_fisheye:
-            safe = np.where(radius > 0, radius, 1.0)
-            places = places * np.where(radius > 0, np.arctan(safe) / safe, 1.0)
-            radius = np.arctan(radius)
+        if self.is_fisheye or self.mirror:
+            shrunk = np.arctan if self.mirror is None else self.mirror.shrunk
+            safe = np.maximum(radius, _LEAST)
+            places, radius = places * shrunk(safe) / safe, shrunk(radius)
         seen = self._bent(np.where(radius < self._limit()[0], places, np.nan))
         return seen @ self.K[:2, :2].T + self.K[:2, 2]
 
@@ -102,14 +156,14 @@ class Lens(NamedTuple):
             size = np.linalg.norm(place, axis=-1, keepdims=True)
             place = place * np.minimum(1.0, limit / np.maximum(size, limit))
         error = np.linalg.norm(self._bent(place) - target, axis=-1)
-        if self.is_fisheye:
-            angle = np.linalg.norm(place, axis=-1, keepdims=True)
-            safe = np.where(angle > 0, angle, 1.0)
-            place = place * np.where(angle > 0, np.tan(safe) / safe, 1.0)
+        if self.is_fisheye or self.mirror:
+            spread = np.tan if self.mirror is None else self.mirror.spread
+            safe = np.maximum(np.linalg.norm(place, axis=-1, keepdims=True), _LEAST)
+            place = place * np.minimum(spread(safe), math.tan(_FARTHEST)) / safe
         return place, error < 1e-5 * (1 + far[..., 0])
 
     def _bent(self, places: np.ndarray) -> np.ndarray:
-        """(a', b') of places, which for a fisheye lens are angles from the axis."""
+        """(a', b') of places, of a fisheye lens of angles from the axis, else behind the mirror."""
         a, b = np.moveaxis(places, -1, 0)
         r2 = a * a + b * b
         numbers = np.zeros(MOST_COEFFICIENTS[self.is_fisheye])
@@ -133,7 +187,7 @@ class Lens(NamedTuple):
 
     def _limit(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Up to which radius (or angle) the radial part grows, and its values up to there."""
-        return _radial(self.coefficients, self.is_fisheye)
+        return _radial(self.coefficients, self.is_fisheye, self.mirror)
 
     def straightened_K(
         self, image_size_wh: tuple[int, int], fov: float | None = None
@@ -223,10 +277,13 @@ def _polynomial(x: np.ndarray, *coefficients: float) -> np.ndarray:
 
 @cache
 def _radial(
-    coefficients: tuple[float, ...], is_fisheye: bool
+    coefficients: tuple[float, ...], is_fisheye: bool, mirror: Mirror | None
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Up to which radius (or angle) the radial part grows, and its values up to there."""
-    radii = np.linspace(0, _FARTHEST if is_fisheye else math.tan(_FARTHEST), 4001)
+    farthest = np.array(math.tan(_FARTHEST))
+    if mirror is not None:
+        farthest = mirror.shrunk(farthest)
+    radii = np.linspace(0, _FARTHEST if is_fisheye else float(farthest), 4001)
     k1, k2, _, _, *more = *coefficients, *[0.0] * (MOST_COEFFICIENTS[False] - len(coefficients))
     radial = coefficients if is_fisheye else (k1, k2, 0.0, 0.0, *more[:4])
     bent = Lens(np.eye(3), radial, is_fisheye)._bent(np.stack([radii, 0 * radii], -1))[:, 0]
