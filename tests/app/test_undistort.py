@@ -105,6 +105,52 @@ def test_frames_keep_their_times(recorded: Path) -> None:
     assert any("variable frame rate" in note for note in notes)
 
 
+def test_masks_are_made_straight_too(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They cover what they covered."""
+    rows, columns = np.indices((SIZE[1], SIZE[0]))
+    covered = (np.hypot(columns - 90, rows - 40) < 15)[..., None] & np.ones(3, bool)
+    write_film(recorded / "masks.mp4", [255 * covered.astype(np.uint8)] * 3)
+    given = ["undistort", f"{recorded}/wide.mp4", "--camera", f"{recorded}/lens.json"]
+    more = ["--masks", f"{recorded}/masks.mp4", "--out", f"{recorded}/straight"]
+    assert cli.main([*given, *more]) == 0
+    path = recorded / "straight" / "wide_masks.mp4"
+    assert f"--masks {path}" in capsys.readouterr().out.splitlines()[-1]
+    loaded, lens = load_lens(recorded / "lens.json")
+    mask = next(iter(VideoReader(path))).image[..., 0] > 127
+    found = np.argwhere(mask)[:, ::-1].astype(float)
+    assert len(found) > 500
+    K_straight = loaded.camera.K.numpy()
+    places = (found - K_straight[:2, 2]) / np.diagonal(K_straight)[:2]
+    away = np.hypot(*(lens.pixels(places) - (90, 40)).T)
+    assert away.max() < 17
+    assert away.max() > 13
+
+
+def test_several_cameras_in_one_folder(recorded: Path) -> None:
+    content = json.loads((recorded / "lens.json").read_text())
+    content["cameras"]["other"] = {**content["cameras"]["wide"], "t": [0.5, 0, 0]}
+    (recorded / "lens.json").write_text(json.dumps(content))
+    (recorded / "b").mkdir()
+    for name in ("other.mp4", "b/wide.mp4"):
+        (recorded / name).write_bytes((recorded / "wide.mp4").read_bytes())
+    out = recorded / "straight"
+    for name in ("wide", "other", "wide"):
+        undistort_video(
+            ViewFiles(video=recorded / f"{name}.mp4", keypoints=None), recorded / "lens.json", out
+        )
+    for name, place in (("wide", 0.0), ("other", -0.5)):
+        camera = load_camera(out / "cameras.json", video=out / f"{name}.mp4").camera
+        assert (camera.name, float(camera.centre_world[0])) == (name, place)
+    files = ViewFiles(video=recorded / "b" / "wide.mp4", keypoints=None, camera_name="other")
+    with pytest.raises(CameraError, match=r"wide\.mp4 is camera 'wide' there"):
+        undistort_video(files, recorded / "lens.json", out)
+    (out / "cameras.json").write_text("[]")
+    with pytest.raises(CameraError, match="not of torchcss undistort; name another --out"):
+        undistort_video(
+            ViewFiles(video=recorded / "wide.mp4", keypoints=None), recorded / "lens.json", out
+        )
+
+
 def test_a_camera_without_a_place_stays_without(recorded: Path) -> None:
     entry = {"K": K, "image_size_wh": SIZE, "dist": [0.1, 0, 0, 0, 0, 0.2, 0, 0]}
     (recorded / "lens.json").write_text(json.dumps(entry))

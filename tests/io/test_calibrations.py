@@ -573,6 +573,20 @@ def test_vicon(tmp_path: Path, k3: float | None) -> None:
     np.testing.assert_allclose(camera.project(points).uv, seen, atol=0.05)
 
 
+@pytest.mark.parametrize("name", ["a.json", "a.toml"])
+def test_a_unit_that_a_camera_says_itself(tmp_path: Path, name: str) -> None:
+    camera = {"matrix": K, "size": SIZE, "rotation": [0, 0, 0], "translation": [0, 0, 3000],
+              "units": "mm"}  # fmt: skip
+    text = json.dumps({"a": camera})
+    if name == "a.toml":
+        lines = (f"{word} = {json.dumps(value)}" for word, value in camera.items())
+        text = "\n".join(["[a]", *lines])
+    (tmp_path / name).write_text(text)
+    loaded = load_camera(tmp_path / name)
+    assert loaded.metric
+    assert loaded.camera.t_camera_world.tolist() == [0, 0, 3]
+
+
 def test_a_film_called_by_its_cameras_serial_number(tmp_path: Path) -> None:
     given = {"k1": 0, "k2": 0, "turn": "0 0 0 1", "place": "0 0 0", "more": "", "radial": ""}
     text = VICON.format(**given)

@@ -15,7 +15,8 @@ from torchcss.types import frozen
 class Undistort:
     """Make straight pictures of a fisheye lens's, or of OpenCV's lens of 8 coefficients or more.
 
-    What torchcss track takes comes out: the video, its camera, and its keypoints.
+    What torchcss track takes comes out: the video, its camera, its keypoints and its masks. Of
+    several cameras make each one's video straight, all into one folder.
     """
 
     video: PathArgument
@@ -26,6 +27,8 @@ class Undistort:
     """Output folder."""
     keypoints: Path | None = None
     """2D joints of the video as recorded."""
+    masks: Path | None = None
+    """Masks of the video as recorded."""
     start: int = 0
     """The first frame that will be tracked, in which the person is chosen."""
     camera_name: str | None = None
@@ -47,6 +50,7 @@ class Undistort:
         files = ViewFiles(
             video=self.video,
             keypoints=self.keypoints,
+            masks=self.masks,
             camera_name=self.camera_name,
             layout=self.layout,
             normalised=self.normalised,
@@ -56,5 +60,7 @@ class Undistort:
         paths, notes = undistort_video(files, self.camera, self.out, fov=self.fov, start=self.start)
         for note in notes:
             print(note)
-        options = zip(("", "--camera ", "--keypoints "), paths, strict=False)
-        print("torchcss track " + " ".join(f"{option}{path}" for option, path in options))
+        said = {".json": "--camera ", ".npz": "--keypoints "}
+        video, *others = paths
+        options = (f"{said.get(path.suffix, '--masks ')}{path}" for path in others)
+        print(" ".join(["torchcss track", str(video), *options]))

@@ -282,7 +282,7 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         **found,
         image_size_wh=size,
         distortion=lens,
-        units=units,
+        units=units if (own := first_of(values, ("units", "unit"))) is None else own,
         video=video,
         fisheye=fisheye,
         name=values.get("name"),
@@ -343,7 +343,7 @@ def _one_by_one(values: Mapping[str, Any]) -> list[Any] | None:
     return [*focal, *centre] if given and len(focal) == len(centre) == 2 else None
 
 
-def _lens(values: Mapping[str, Any], fisheye: bool | str = False) -> Any:
+def _lens(values: Mapping[str, Any], fisheye: bool | str | Mirror = False) -> Any:
     """The coefficients of the lens in OpenCV's order, or whatever stands in their place."""
     lenses = [
         _plain(each)
@@ -607,6 +607,8 @@ def _read_toml(path: Path) -> dict[str, Entry]:
     if isinstance(metadata, dict) and "units" in metadata:
         units = metadata["units"]
         return {name: entry._replace(units=units) for name, entry in entries.items()}
+    if any(entry.units != "metre" for entry in entries.values()):
+        return entries  # which say their own
     return _in_metres(entries, "metadata" in content)
 
 

@@ -1754,3 +1754,38 @@ def test_boxes_of_objects_beside_keypoints(tmp_path: Path) -> None:
     frames = [{"frame": t, "objects": [{"bbox": [0, 0, 9, 9]}], "keypoints": person(t).tolist()}
               for t in T]  # fmt: skip
     check(read(write(tmp_path / "a.json", frames)))
+
+
+@pytest.mark.parametrize("kind", ["MMPose", "Ultralytics", "arrays", "a table"])
+def test_the_size_by_other_words(tmp_path: Path, kind: str) -> None:
+    """Height and width, and columns; joints of a smaller picture lie inside any larger one."""
+    half = np.stack([person(t) for t in T]) * (0.5, 0.5, 1)
+    path = tmp_path / {"arrays": "a.npz", "a table": "a.csv"}.get(kind, "a.json")
+    if kind == "arrays":
+        np.savez(path, keypoints=half, joint_names=np.array(COCO), orig_shape=[240, 320, 3])
+    elif kind == "a table":
+        rows = [
+            ["320", "240", str(t), n, *map(str, joint)]
+            for t in T
+            for n, joint in zip(TFJS, half[t], strict=True)
+        ]
+        heading = ["image_width", "image_height", "frame", "joint", "x", "y", "score"]
+        path.write_text("\n".join(",".join(row) for row in [heading, *rows]))
+    elif kind == "MMPose":
+        write(path, [
+            {"frame_id": t, "img_shape": [240, 320], "instances": [
+                {"keypoints": half[t, :, :2].tolist(), "keypoint_scores": half[t, :, 2].tolist()}
+            ]} for t in T
+        ])  # fmt: skip
+    else:
+        write(
+            path, {"orig_shape": [240, 320], "frames": [{"keypoints": half[t].tolist()} for t in T]}
+        )
+    found = read(path)
+    check(found)
+    assert any("scaled from images of 320 x 240" in line for line in found.report)
+    rows = [f"60,90,{t},{n},{x},{y},{c}" for t in T
+            for n, (x, y, c) in zip(TFJS, person(t), strict=True)]  # fmt: skip
+    path = tmp_path / "b.csv"  # a person's width and height
+    path.write_text("\n".join(["width,height,frame,joint,x,y,score", *rows]))
+    check(read(path))

@@ -36,7 +36,7 @@ from torchcss.io.keypoints.people import (
     is_there,
     screened,
 )
-from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SIDES, SIZES, first_of
+from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SHAPES, SIDES, SIZES, first_of
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
@@ -113,6 +113,8 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
 
 def _size(numbers: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """Width and height, as one array or as two."""
+    if (shape := first_of(numbers, SHAPES)) is not None and shape.shape in ((2,), (3,)):
+        return shape[1::-1]
     sides = ([first_of(numbers, (side,)) for side in pair] for pair in SIDES)
     pairs = [np.array([w, h]) for w, h in sides if w is not None and h is not None]
     return next(iter(pairs), None) if (size := first_of(numbers, SIZES)) is None else size

@@ -31,6 +31,7 @@ from torchcss.io.keypoints.words import (
     CONFIDENCES,
     JOINT_WORDS,
     SCORES,
+    SHAPES,
     SIDES,
     SIZES,
     first_of,
@@ -277,8 +278,9 @@ def said_size(content: object) -> tuple[float, float] | None:
     if isinstance(content, list) and content:
         content = content[0]
     for head in heads(content):
-        size = first_of(head, SIZES)
+        size, shape = first_of(head, SIZES), first_of(head, SHAPES)
         sizes = [size if isinstance(size, list) else []]
+        sizes += [shape[1::-1] if isinstance(shape, list) else []]
         sizes += [[first_of(head, (side,)) for side in pair] for pair in SIDES]
         for pair in sizes:
             if len(pair) == 2 and all(isinstance(n, (int, float)) and n > 0 for n in pair):

@@ -136,7 +136,21 @@ def people_of_rows(rows: list[Row]) -> People:
         return People(people, None, report, LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
-    return People(people, names, report, first=first, by_hand=heading == [*_HAND])
+    size = _said_size(heading, rows[1:])
+    return People(people, names, report, first=first, by_hand=heading == [*_HAND], size_wh=size)
+
+
+def _said_size(heading: Sequence[str], rows: Sequence[Row]) -> tuple[float, float] | None:
+    """The size of the pictures, where all rows say the same; a bare width may be a person's."""
+    places = {cell: n for n, cell in enumerate(heading)}
+    for pair in words.SIDES[:-1]:
+        columns = [words.first_of(places, (side,)) for side in pair]
+        said = {tuple("".join(row[n : n + 1]) for n in columns if n is not None) for _, row in rows}
+        if None not in columns and len(said) == 1:
+            with suppress(ValueError):
+                width, height = map(float, *said)
+                return (width, height) if min(width, height) > 0 else None
+    return None
 
 
 def _without_hands(

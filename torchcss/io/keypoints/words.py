@@ -81,6 +81,9 @@ ORDER_NAMES = names_in(
 SIZES = names_in("imagesizewh imagesize imgsize resolution videosize framesize")
 """Width and height in this order."""
 
+SHAPES = names_in("origshape orishape imgshape imageshape inputshape frameshape imagesizehw")
+"""Height and width in this order, and a number of colours it may be (Ultralytics, MMPose)."""
+
 SIDES = tuple(
     (f"{of}width", f"{of}height")
     for of in ("canvas", "image", "video", "frame", "img", "original", "")
