@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, check_floating, check_shape
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -154,33 +158,20 @@ def euler_angles(
 
 def axis_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Rotation vectors: the axis times the angle in [0, pi], radians."""
-    quaternion = quaternions(rotation)
-    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
-    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, quaternion[..., :1])
-    ratio = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
-    return ratio * quaternion[..., 1:]
+    return _of_scipy(rotation).as_rotvec().reshape(rotation.shape[:-1])
 
 
 def quaternions(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 4"]:
-    """Unit quaternions (w, x, y, z) whose largest entry is positive (Shepperd 1978)."""
-    r = rotation
-    trace = np.trace(r, axis1=-2, axis2=-1)
-    diagonal = np.diagonal(r, axis1=-2, axis2=-1)
-    # Row m: the quaternion times four times its entry m, from sums and differences.
-    skew = np.stack(
-        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]],
-        axis=-1,
-    )
-    rows = np.zeros((*trace.shape, 4, 4))
-    rows[..., 0, 0] = 1.0 + trace
-    rows[..., 0, 1:] = rows[..., 1:, 0] = skew
-    rows[..., 1:, 1:] = r + np.swapaxes(r, -1, -2)
-    for m in range(3):
-        rows[..., 1 + m, 1 + m] = 1.0 + 2.0 * diagonal[..., m] - trace
-    largest = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    quaternion = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
-    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    """Unit quaternions (w, x, y, z); of the two that are one rotation any."""
+    quaternion = np.roll(_of_scipy(rotation).as_quat(), 1, axis=-1)
+    return quaternion.reshape(*rotation.shape[:-2], 4)
+
+
+def _of_scipy(rotation: Float[np.ndarray, "*batch 3 3"]) -> Rotation:
+    """Rotations in a row, as SciPy has them."""
+    from scipy.spatial.transform import Rotation  # takes a second to import
+
+    return Rotation.from_matrix(rotation.reshape(-1, 3, 3))
 
 
 def within_half_turn(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

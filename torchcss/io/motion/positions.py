@@ -240,19 +240,12 @@ def _interpolate(
     samples: Float[np.ndarray, "t *rest"], place: Float[np.ndarray, " s"]
 ) -> Float[np.ndarray, "s *rest"]:
     """Cubic Hermite interpolation at fractional indices."""
+    from scipy.interpolate import CubicHermiteSpline  # takes a second to import
+
     if len(samples) == 1:
         return np.repeat(samples, len(place), axis=0)
     slope = np.gradient(samples, axis=0, edge_order=2 if len(samples) > 2 else 1)
     if len(samples) > 4:
         ahead, behind = samples[4:] - samples[:-4], samples[3:-1] - samples[1:-3]
         slope[2:-2] = (8 * behind - ahead) / 12
-    first = np.floor(place).astype(int).clip(0, len(samples) - 2)
-    u = (place - first).reshape(-1, *[1] * (samples.ndim - 1))
-    a, b = samples[first], samples[first + 1]
-    c, d = slope[first], slope[first + 1]
-    return (
-        (1 + 2 * u) * (1 - u) ** 2 * a
-        + u * (1 - u) ** 2 * c
-        + u * u * (3 - 2 * u) * b
-        + u * u * (u - 1) * d
-    )
+    return CubicHermiteSpline(np.arange(len(samples)), samples, slope)(place)
