@@ -154,6 +154,13 @@ def test_help(verb: str, capsys: pytest.CaptureFixture[str]):
     assert "--seed" in capsys.readouterr().out
 
 
+def test_a_demo_tells_of_a_file_that_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    options = ("--frames", "1", "--samples", "4", "--no-overlay")
+    assert cli.main(["demo", "--out", str(tmp_path / "out"), *options]) == 0
+    told = capsys.readouterr().out.split("look at ")[1].strip()
+    assert Path(told).is_file()
+
+
 @pytest.mark.parametrize("option", [("--evidence", "0.3"), ("--evidence=0.3",)])
 def test_options_of_version_0_1_are_understood(files: Path, option: tuple[str, ...]):
     assert track(files, "--no-overlay", *option) == 0

@@ -30,7 +30,7 @@ from torchcss.app.recorder import Terminated
 from torchcss.cli.detect import Detect
 from torchcss.cli.export import Export
 from torchcss.cli.init import Init
-from torchcss.cli.options import SettingsOptions, Terminal, TerminalOptions
+from torchcss.cli.options import SettingsOptions, Terminal, TerminalOptions, first_look
 from torchcss.cli.smooth import Smooth
 from torchcss.cli.track import Track
 from torchcss.cli.undistort import Undistort
@@ -60,7 +60,7 @@ class Demo:
             f"{summary['num_frames']} frames, {summary['seconds_per_frame']:.2f} s each\n"
             f"mean error of the best mode   {summary['mpjpe_mm']:6.1f} mm\n"
             f"mean error, best of the modes {summary['mpjpe_best_of_modes_mm']:6.1f} mm\n"
-            f"look at {self.out / 'report.html'}",
+            f"look at {first_look(self.out, self.settings)}",
         )
 
 

@@ -20,7 +20,7 @@ from typing import Annotated
 import tyro
 
 from torchcss.io.run import Given
-from torchcss.io.tracks import read_summary
+from torchcss.io.tracks import TRACK_NAME, read_summary
 from torchcss.tracking.settings import Settings
 from torchcss.types import frozen
 
@@ -32,6 +32,11 @@ GivenOptions = Annotated[Given, tyro.conf.OmitArgPrefixes]
 
 SettingsOptions = Annotated[Settings, tyro.conf.arg(name="")]
 """How to track; each field is an option of its own name."""
+
+
+def first_look(folder: Path, settings: Settings) -> Path:
+    """The file of a finished run that its user opens first."""
+    return folder / ("report.html" if settings.overlay else TRACK_NAME)
 
 
 @frozen

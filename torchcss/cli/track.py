@@ -11,7 +11,13 @@ import tyro
 
 from torchcss.app.smooth import report, smooth
 from torchcss.app.track import TrackOptions, track_video
-from torchcss.cli.options import PathArgument, SettingsOptions, Terminal, TerminalOptions
+from torchcss.cli.options import (
+    PathArgument,
+    SettingsOptions,
+    Terminal,
+    TerminalOptions,
+    first_look,
+)
 from torchcss.errors import ConfigurationError, OutputError
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.view_files import ViewFiles
@@ -94,7 +100,7 @@ class Track:
                 run = smooth(run, images=self.smooth_images)
         lines = [
             f"{run.summary['num_frames']} frames, {run.summary['seconds_per_frame']:.2f} s each; "
-            f"look at {self.out / ('report.html' if self.settings.overlay else 'track.npz')}"
+            f"look at {first_look(self.out, self.settings)}"
         ]
         if "smoothed" in run.summary:
             lines.append(report(run.summary["smoothed"]))
