@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -253,6 +254,8 @@ def test_a_csv_and_folders(tmp_path: Path) -> None:
         ('{"video": "v", "seed": 1.5}', "seed: expected a whole number"),
         ('{"video": "v", "focal": "long"}', "focal: expected a number"),
         ('{"video": ["v"]}', "video: expected a text"),
+        ('{"video": true}', "video: expected a text"),
+        ('{"video": "v"}\n\n{"camera": "c"}', "line 3: expected a column video"),
         ("[" * 100_000, "line 1: no JSON"),
         *(
             (json.dumps({"video": "v", "name": name}), "cannot be the name of a folder")
@@ -265,3 +268,23 @@ def test_bad_manifests(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigurationError, match=message):
         read_manifest(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("video,name\nv.mp4,a,b\n", "row 1: more cells than columns"),
+        ("video,name,video\nv.mp4,a,w.mp4\n", "two columns are called video"),
+    ],
+)
+def test_bad_tables(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "clips.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError, match=message):
+        read_manifest(path)
+
+
+@pytest.mark.parametrize("patience", [0.0, math.nan, math.inf])
+def test_patience_is_a_time_that_can_be_waited(patience: float) -> None:
+    with pytest.raises(ConfigurationError, match="patience"):
+        Batch(manifest=Path("clips.csv"), patience=patience)

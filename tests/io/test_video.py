@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import signal
 import struct
@@ -678,8 +679,10 @@ def test_bad_folders(tmp_path: Path) -> None:
     frames, error = read_until_error(VideoReader(tmp_path))
     assert len(frames) == 1
     assert "1.png" in str(error)
-    with pytest.raises(VideoError, match="per second"):
-        VideoReader(tmp_path, image_frame_rate=0)
+    for rate in (0, -1, math.nan, math.inf):
+        with pytest.raises(VideoError, match="per second"):
+            VideoReader(tmp_path, image_frame_rate=rate)
+    assert VideoReader(tmp_path, image_frame_rate=1 / 3600).info.frame_rate > 0
 
 
 def test_pictures_of_several_sizes_are_told_at_once(

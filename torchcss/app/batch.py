@@ -28,6 +28,7 @@ import re
 import shutil
 import signal
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -110,9 +111,9 @@ class Batch:
     settings: Annotated[Settings, tyro.conf.arg(name="")] = Settings()
 
     def __post_init__(self) -> None:
-        if self.workers < 1 or not self.patience > 0:
+        if self.workers < 1 or not 0 < self.patience < threading.TIMEOUT_MAX:
             raise ConfigurationError(
-                f"expected at least 1 worker and some patience, got {self.workers} and "
+                f"expected at least 1 worker and some seconds of patience, got {self.workers} and "
                 f"{self.patience}"
             )
 
@@ -211,21 +212,26 @@ def read_manifest(path: Path) -> list[Clip]:
     """The clips of a CSV, of JSON lines, or of a folder.
 
     Raises:
-        ConfigurationError: If it is none, a column is unknown, or two clips have one name.
+        ConfigurationError: If it is none, a column is unknown or there twice, or two clips have one
+            name.
     """
+    rows: dict[str, Any] = {}
     if path.is_dir():
-        rows = list(_rows_of_folder(path))
+        rows = {row["video"]: row for row in _rows_of_folder(path)}
     elif path.suffix.lower() == ".csv":
         text = read_text(path, ConfigurationError)
         with refusing(ConfigurationError, f"{path}: not a table"):
-            rows = list(csv.DictReader(io.StringIO(text, newline="")))
+            table = csv.DictReader(io.StringIO(text, newline=""))
+            rows = {f"{path}: row {number}": row for number, row in enumerate(table, 1)}
+        columns = table.fieldnames or ()
+        if twice := [name for name in columns if columns.count(name) > 1]:
+            raise ConfigurationError(f"{path}: two columns are called {twice[0]}; expected one")
     else:
-        rows = []
         for number, line in enumerate(read_text(path, ConfigurationError).split("\n"), 1):
             with refusing(ConfigurationError, f"{path}: line {number}: no JSON"):
-                rows += [json.loads(line)] if line.strip() else []
+                rows |= {f"{path}: line {number}": json.loads(line)} if line.strip() else {}
     folder = path if path.is_dir() else path.parent
-    clips = [_clip(row, f"{path}: row {number}", folder) for number, row in enumerate(rows, 1)]
+    clips = [_clip(row, where, folder) for where, row in rows.items()]
     if not clips:
         raise ConfigurationError(f"{path}: no clips in it")
     names = [clip.name for clip in clips]
@@ -247,6 +253,8 @@ def _rows_of_folder(folder: Path) -> Iterator[dict[str, str]]:
 def _clip(row: object, where: str, folder: Path) -> Clip:
     if not isinstance(row, Mapping) or not row.get("video"):
         raise ConfigurationError(f"{where}: expected a column video")
+    if None in row:  # as `csv` calls the column of what has none
+        raise ConfigurationError(f"{where}: more cells than columns; quote a cell that has a comma")
     if unknown := sorted(str(name) for name in row if name not in _COLUMNS):
         raise ConfigurationError(
             f"{where}: unknown column {unknown[0]!r}; there are {', '.join(_COLUMNS)}"
@@ -257,7 +265,7 @@ def _clip(row: object, where: str, folder: Path) -> Clip:
             continue
         kind = _NUMBERS.get(name, str)
         with suppress(ValueError):
-            if isinstance(value, str | int | float):
+            if isinstance(value, str | int | float) and not isinstance(value, bool):
                 given[name] = kind(str(value))
         if name not in given:
             what = {int: "a whole number", float: "a number", str: "a text"}[kind]

@@ -5,9 +5,9 @@
 and `t`, and `video`, the name of the file that it took. Where a file lacks the image size, it is
 the video's.
 
-Units are metres inside (decision "units"). Where the extrinsics are in another unit, or absent,
-the camera is used in its own frame, x right, y down, z forward: one view needs no more than the
-intrinsics, and a made-up scale would be worse. `LoadedCamera.units_note` says so.
+Units are metres inside (decision "units"). Where the extrinsics are in a unit that is not known, or
+absent, the camera is used in its own frame, x right, y down, z forward: one view needs no more than
+the intrinsics, and a made-up scale would be worse. `LoadedCamera.units_note` says so.
 
 By default: `read_camera(path, name)` or `read_cameras(path)`; for a video
 `load_camera(path, video=video_path)`, then `check_image_size(camera, width, height)`.

@@ -16,6 +16,7 @@ By default: `for frame in VideoReader(path)` and `with VideoWriter(path, frame_r
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import Counter
@@ -125,7 +126,6 @@ class VideoReader:
         self.path = Path(path)
         self._start, self._stop, self._stride = start, stop, stride
         rate = 30 if image_frame_rate is None else image_frame_rate
-        self._image_frame_rate = Fraction(rate).limit_denominator(1001)
         with naming(self.path, VideoError):
             if stride < 1:
                 raise VideoError(f"stride must be at least 1, got {stride}")
@@ -133,8 +133,10 @@ class VideoReader:
                 raise VideoError(f"start must be at least 0, got {start}")
             if stop is not None and stop <= start:
                 raise VideoError(f"stop must be greater than start, got start {start}, stop {stop}")
-            if self._image_frame_rate <= 0:
-                raise VideoError(f"frames per second must be positive, got {image_frame_rate}")
+            if not 0 < rate < math.inf:
+                raise VideoError(f"frames per second must be positive, got {rate}")
+            # Pictures taken hours apart have too small a rate for such denominators.
+            self._image_frame_rate = Fraction(rate).limit_denominator(1001) or Fraction(rate)
             self._images = self._find_images()
         if self._images is None:
             self.info = self._probe_container()
