@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +15,14 @@ from torchcss.app import recorder
 from torchcss.app.recorder import Picture
 from torchcss.app.track import TrackOptions, track_video
 from torchcss.body.load import load_body
+from torchcss.body.model import BodyModel
 from torchcss.io.cameras import load_camera, read_camera
-from torchcss.io.tracks import load_track, read_summary
+from torchcss.io.tracks import FrameModes, load_track, read_summary
 from torchcss.io.video import VideoReader
 from torchcss.show.track_plots import bones_of
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
+from torchcss.vision.camera import Camera
 
 SETTINGS = Settings(body="arm7", samples=3, modes=2, terms=("joints",))
 
@@ -38,16 +39,16 @@ def files(files: Path) -> Path:
 
 def test_a_live_recording_is_the_track(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chunk = pytest.importorskip("rerun.chunk")
-    drawn, draw = [], recorder.draw_poses
+    drawn, draw = [], recorder.draw_modes
 
-    def count(*arguments: Any, text: str, **named: Any) -> np.ndarray:
-        drawn.append(text)
-        return draw(*arguments, text=text, **named)
+    def count(image: np.ndarray, body: BodyModel, modes: FrameModes, camera: Camera) -> np.ndarray:
+        drawn.append(modes.frame)
+        return draw(image, body, modes, camera)
 
-    monkeypatch.setattr(recorder, "draw_poses", count)
+    monkeypatch.setattr(recorder, "draw_modes", count)
     saved = files / "live.rrd"
     assert track(files, "--live-save", str(saved)) == 0
-    assert [text.split()[1] for text in drawn] == ["0", "1", "2"]
+    assert drawn == [0, 1, 2]
     result = load_track(files / "out")
     strips, pictures = {}, {}
     for piece in chunk.RrdReader(saved).stream():

@@ -43,8 +43,7 @@ from torchcss.io.tracks import (
     write_summary,
 )
 from torchcss.io.view_files import RecordedCamera
-from torchcss.show.overlay import draw_poses
-from torchcss.show.track_pictures import caption
+from torchcss.show.track_pictures import draw_modes
 from torchcss.tracking.checkpoint import state_tensors
 from torchcss.tracking.session import Posterior, TrackingSession
 from torchcss.types import Status
@@ -68,11 +67,8 @@ class Picture:
     @cached_property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
         """The frame with its modes drawn over it."""
-        frame, modes = self._frame, self._frame.state.mixture
-        text = caption(frame.frame.index, len(modes.mean), float(frame.info.cost[0]))
-        return draw_poses(
-            frame.frame.image, frame.body, modes.mean, self.camera, weights=modes.weight, text=text
-        )
+        frame = self._frame
+        return draw_modes(frame.frame.image, frame.body, modes_of(frame), self.camera)
 
 
 class Sink(Protocol):

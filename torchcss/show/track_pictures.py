@@ -14,13 +14,15 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from torchcss.body.model import BodyModel
 from torchcss.errors import VideoError
 from torchcss.io.cameras import check_image_size
 from torchcss.io.run import Run
-from torchcss.io.tracks import TRACK_NAME
+from torchcss.io.tracks import TRACK_NAME, FrameModes
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_poses
+from torchcss.vision.camera import Camera
 
 OVERLAY_NAME = "overlay.mp4"
 
@@ -63,7 +65,7 @@ def write_overlays(run: Run, frame_rate: float) -> list[Path]:
         with VideoWriter(run.folder / name, frame_rate) as film:
             for row, image in _frames_of(run, recorded, range(len(run.track.frames))):
                 image = np.zeros((height, width, 3), np.uint8) if image is None else image
-                film.write(_draw_row(run, recorded, row, image))
+                film.write(draw_modes(image, run.body, run.track.modes(row), recorded.camera))
         films.append(run.folder / name)
     return films
 
@@ -117,7 +119,7 @@ def pictures_of(
             if image is None:
                 missing += 1
             else:
-                yield row, _draw_row(run, first, row, image)
+                yield row, draw_modes(image, run.body, run.track.modes(row), first.camera)
     else:
         return
     if missing:
@@ -141,15 +143,21 @@ def _frames_of(
         yield row, frame.image if frame is not None and frame.index == index else None
 
 
-def _draw_row(run: Run, recorded: RecordedCamera, row: int, image: Picture) -> Picture:
-    """Draw the modes of a frame, counted in the track, over its image."""
-    modes = run.track.modes(row)
-    body = run.body.with_base(modes.base_transform[:3, :3], modes.base_transform[:3, 3])
+def draw_modes(image: Picture, body: BodyModel, modes: FrameModes, camera: Camera) -> Picture:
+    """Draw the modes of a frame over its image.
+
+    Args:
+        image: The image.
+        body: The body, on any base.
+        modes: The modes, the best first.
+        camera: The image's camera.
+    """
+    base = modes.base_transform
     return draw_poses(
         image,
-        body,
+        body.with_base(base[:3, :3], base[:3, 3]).to(dtype=torch.float64, device="cpu"),
         modes.state,
-        recorded.camera.to(dtype=torch.float64, device="cpu"),
+        camera.to(dtype=torch.float64, device="cpu"),
         weights=modes.log_weight.exp(),
         text=caption(modes.frame, len(modes.cost), float(modes.cost[0])),
     )
