@@ -156,3 +156,15 @@ def test_a_command_starts_without_what_it_does_not_use() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY
     )
     assert done.stdout.strip() == "[]", done.stdout
+
+
+def test_prose_fits_a_screen() -> None:
+    """At most 120 signs a line, but for tables, formulas, and the page that is made of reports."""
+    pages = [REPOSITORY / "README.md", REPOSITORY / "CHANGELOG.md", *REPOSITORY.glob("docs/*.md")]
+    wide = [
+        f"{page.name}:{number}"
+        for page in pages
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        if len(line) > 120 and not line.startswith(("|", "$$")) and page.name != "results.md"
+    ]
+    assert wide == []
