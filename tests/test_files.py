@@ -216,3 +216,10 @@ def test_smoothing_that_fails_leaves_the_older_file(
     with pytest.raises(TorchcssError, match="disk is full"):
         smooth(tmp_path)
     assert (tmp_path / "smooth.npz").read_bytes() == before
+
+
+def test_arrays_are_written_under_the_name_that_was_asked_for(tmp_path: Path) -> None:
+    for name in ("a.npz", "b", "c.d"):
+        torchcss.files.save_arrays(tmp_path / name, {"a": torch.ones(2)})
+        assert list(torchcss.files.load_arrays(tmp_path / name, OutputError)) == ["a"]
+    assert len(list(tmp_path.iterdir())) == 3

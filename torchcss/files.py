@@ -97,8 +97,9 @@ def save_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fal
         OutputError: If it cannot be written.
     """
     plain: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
-    with replace_file(path) as partial:
-        (np.savez_compressed if compressed else np.savez)(partial, **plain)
+    # Of a path NumPy would change the name, where that does not end in .npz.
+    with replace_file(path) as partial, partial.open("wb") as stream:
+        (np.savez_compressed if compressed else np.savez)(stream, **plain)
 
 
 def extend_arrays(path: Path, arrays: Mapping[str, Any], fill: Mapping[str, float]) -> None:

@@ -12,7 +12,7 @@ import pytest
 import torchcss
 from torchcss.app.detect import detect_video, is_detected, masks_of
 from torchcss.app.view_files import FrameSelection, open_view
-from torchcss.errors import KeypointError, TorchcssError
+from torchcss.errors import KeypointError, OutputError, TorchcssError
 from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
@@ -115,6 +115,16 @@ def test_nobody_is_one_line(files: Path) -> None:
     with pytest.raises(KeypointError, match=r"nobody found in 3 frames.*--keypoints"):
         detect_video(files / "video.mp4", files / "found.npz", detector=Crowd([[], [], []]))
     assert not (files / "found.npz").exists()
+
+
+@pytest.mark.parametrize("name", ["found", "found.json", "folder.npz"])
+def test_a_file_that_cannot_be_written_is_told_before_the_work(
+    files: Path, crowd: Crowd, name: str
+) -> None:
+    (files / "folder.npz").mkdir()
+    with pytest.raises(OutputError, match=r"ends in \.npz"):
+        detect_video(files / "video.mp4", files / name, detector=crowd)
+    assert not crowd.asked
 
 
 def test_a_video_alone_is_tracked(

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from torchcss.errors import KeypointError
+from torchcss.errors import KeypointError, OutputError
 from torchcss.files import load_arrays, prepare_output_folder, save_arrays
 from torchcss.io.detect import Detected, Detector, DetectorName, open_detector
 from torchcss.io.keypoints.one_person import identified
@@ -63,8 +63,11 @@ def detect_video(
         The file.
 
     Raises:
-        TorchcssError: If the video or the detector cannot be read, or nobody is found.
+        TorchcssError: If the video or the detector cannot be read, nobody is found, or the file
+            cannot be written.
     """
+    if out.suffix != ".npz" or out.is_dir():
+        raise OutputError(f"{out}: expected a file to write, of a name that ends in .npz")
     options = options or DetectOptions()
     reader = VideoReader(video, start=start, stop=stop, image_frame_rate=frame_rate)
     reader.check_sizes()

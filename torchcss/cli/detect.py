@@ -20,7 +20,7 @@ class Detect:
     video: Annotated[Path | None, tyro.conf.Positional] = None
     """A video in any container, or a folder of images."""
     out: Path = Path("keypoints.npz")
-    """The file to write, which `torchcss track --keypoints` takes."""
+    """The file to write, NAME.npz, which `torchcss track --keypoints` takes."""
     download_model: bool = False
     """Fetch MediaPipe's model into the cache folder, and nothing else where no video is given."""
     start: int = 0
