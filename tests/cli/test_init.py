@@ -91,6 +91,8 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
     capsys.readouterr()
     assert cli.main([*given, "--body", "arm7", "--overwrite"]) == 2
     assert "the fitted body is arm8" in capsys.readouterr().err
+    assert cli.main([*given, "--body", "arm8", "--stature", "2", "--overwrite"]) == 2
+    assert "the stature is said to be 2 m" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

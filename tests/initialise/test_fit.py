@@ -386,6 +386,11 @@ def test_joints_of_a_robot_have_its_own_names(tmp_path: Path, generator: torch.G
         found = initialise(None, marked, camera, given, generator=generator)
         joints = found.body.pose(found.mixture.mean[0]).joints
         torch.testing.assert_close(camera.project(joints).uv, places, rtol=0, atol=1.0)
+    with pytest.raises(BodyError, match=r"stature: .* has the lengths of its file"):
+        initialise(
+            None, marked, camera, str(path), generator=generator,
+            options=InitialiseOptions(stature=1.9),
+        )  # fmt: skip
     with pytest.raises(KeypointError, match=f"unknown joint 'tap'.* {body.joint_names[-1]}"):
         initialise(None, {"tap": (1.0, 2.0)}, camera, body, generator=generator)
 

@@ -89,6 +89,11 @@ def test_what_has_no_open_size_is_refused() -> None:
         stature_on_floor(standing(1.0)._replace(lengths={}), camera(), 0.0)
 
 
+def test_a_floor_that_makes_a_giant_is_refused() -> None:
+    with pytest.raises(BodyError, match="ground: stature: expected a person's height"):
+        stature_on_floor(standing(1.0), camera(), -3 * HEIGHT)
+
+
 def test_a_floor_that_is_nowhere_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="ground"):
         InitialiseOptions(ground=math.nan)

@@ -90,6 +90,14 @@ def test_the_page_says_which_tracker_it_was(folder: Path) -> None:
     assert facts_of(folder, {})["Preset"] == "not known"
 
 
+def test_the_page_says_what_told_the_size(folder: Path) -> None:
+    run = Run.open(folder)
+    track = run.track._replace(joint_names=("l_knee",), size_deviation=0.02)
+    for ground, told in ((None, "METRES, or --ground"), (0.5, "the floor at 0.5 m tells the size")):
+        known = replace(run, track=track._replace(settings={"ground": ground}))
+        assert told in dict(report._facts(known))["Stature"]
+
+
 def facts_of(folder: Path, summary: dict) -> dict[str, str]:
     """What the page tells of a run with keypoints and this summary."""
     write_summary(folder, summary)

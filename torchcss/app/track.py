@@ -31,7 +31,7 @@ from torchcss.errors import CameraError, ConfigurationError, TrackFileError, che
 from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
-from torchcss.initialise.result import Initialisation, scale_of
+from torchcss.initialise.result import Initialisation, check_stature, stature_of
 from torchcss.io.cameras import LoadedCamera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.links import Links
@@ -150,8 +150,8 @@ def track_video(
                 begun = _with_files(begun, Path(video), keypoints, options)
                 return _go_on(begun, settings, selection, options, lock)
         # What is wrong is told before the detector runs, which may take long.
-        scale_of(settings.stature)
         body = load_body(settings.body) if options.first is None else options.first.body
+        check_stature(settings.body, settings.stature)
         if keypoints is None:
             _check_for_detector(body)
         source, is_known = _camera_of(Path(video), camera, options)
@@ -454,7 +454,7 @@ def first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Init
         settings: How it is to be tracked.
 
     Raises:
-        ConfigurationError: If the settings are of another body.
+        ConfigurationError: If the settings are of another body, or stature.
     """
     fitted = read_fitted_body(
         path, camera=camera, dtype=settings.torch_dtype, device=settings.device
@@ -465,7 +465,17 @@ def first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Init
             f"{path}: the fitted body is {fitted.body.name}, to be tracked is {settings.body}; "
             f"give the body {fitted.body.name}"
         )
+    tall, told = stature_of(fitted.lengths, fitted.scale), settings.stature
+    if told is not None and abs(tall / told - 1) > _SAME_STATURE:
+        raise ConfigurationError(
+            f"{path}: the fitted body is {tall:.2f} m tall, the stature is said to be {told:g} m: "
+            "leave it out, or give it where the body is fitted (torchcss init --stature)"
+        )
     return fitted
+
+
+_SAME_STATURE = 0.02
+"""Relative: fitted lengths miss a known stature by so much, where they end at their limits."""
 
 
 def _description(

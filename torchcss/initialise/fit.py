@@ -123,7 +123,8 @@ def initialise(
             or the keypoints are not those of one image.
         CameraError: If the camera is of another image size or looks away from a placed body, or
             there is neither picture nor camera.
-        BodyError: If the stature is no person's, or the floor is to tell the size of another body.
+        BodyError: If the stature is no person's, or stature or floor are to tell the size of
+            another body.
         ConfigurationError: If the floor is known, and several cameras look on.
     """
     options = options or InitialiseOptions()

@@ -37,6 +37,7 @@ from torchcss.initialise.result import (
     STANDARD_STATURE,
     Initialisation,
     as_initialisation,
+    check_stature,
     columns_of,
     fitted_lengths,
     hang_on_best,
@@ -75,7 +76,7 @@ def fit_joints(
     Raises:
         KeypointError: If too few joints of the body are seen, or all at one place.
         CameraError: If the camera looks away from a placed body.
-        BodyError: If the stature is no person's.
+        BodyError: If the stature is no person's, or is given for a body from a file.
     """
     scale = scale_of(options.stature)
     # Arms are placed by the fit; afterwards their shoulder stays where it was found.
@@ -87,6 +88,8 @@ def fit_joints(
             free_proportions=options.search.parameters, free_root=True,
         )
     )  # fmt: skip
+    if free is not body:
+        check_stature(free.name, options.stature)
     assert view.keypoints is not None
     keypoints = view.keypoints.only(free.joint_names).to(free.tie)
     keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))

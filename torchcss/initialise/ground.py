@@ -14,7 +14,8 @@ import math
 
 from torchcss.cost.anthropometric import Anthropometric
 from torchcss.errors import BodyError, CameraError
-from torchcss.initialise.result import Initialisation, stature_of
+from torchcss.files import naming
+from torchcss.initialise.result import Initialisation, scale_of, stature_of
 from torchcss.vision.camera import Camera
 
 _SOLES = 0.03
@@ -30,7 +31,7 @@ def stature_on_floor(found: Initialisation, camera: Camera, floor: float) -> tup
         floor: Height of the floor, metres along the axis of the camera's world that points up.
 
     Raises:
-        BodyError: If the body is no person's, whose size is open.
+        BodyError: If the body is no person's, whose size is open, or would be of no person's size.
         CameraError: If it is not known which way is up, or the floor or the soles are not below
             the camera.
     """
@@ -60,4 +61,7 @@ def stature_on_floor(found: Initialisation, camera: Camera, floor: float) -> tup
     usual = Anthropometric().stature
     share = usual**2 / (usual**2 + doubt**2)
     factor = (floor_below / below) ** share
-    return factor * stature_of(found.lengths, found.scale), doubt * math.sqrt(share)
+    stature = factor * stature_of(found.lengths, found.scale)
+    with naming("ground", BodyError):
+        scale_of(stature)
+    return stature, doubt * math.sqrt(share)

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.body.catalog import LENGTHS, PROPORTION_RANGE, Proportions
+from torchcss.body.catalog import BODY_NAMES, LENGTHS, PROPORTION_RANGE, Proportions
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, move_base, root_pose
@@ -236,6 +236,24 @@ def scale_of(stature: float | None) -> float:
     if not 0.4 <= stature <= 2.8:
         raise BodyError(f"stature: expected a person's height in metres, 0.4 to 2.8, got {stature}")
     return stature / STANDARD_STATURE
+
+
+def check_stature(body: str, stature: float | None) -> None:
+    """Refuse a stature that is no person's, or that of a body from a file, which has its own size.
+
+    Args:
+        body: Name of a body that ships, or the path of a file.
+        stature: Metres; None: not known.
+
+    Raises:
+        BodyError: If it is refused.
+    """
+    scale_of(stature)
+    if stature is not None and body not in BODY_NAMES:
+        raise BodyError(
+            f"stature: it tells the size of a person; {body} has the lengths of its file: leave "
+            "it out"
+        )
 
 
 def fitted_lengths(body: BodyModel, x: Vector, stature: float | None) -> dict[str, float]:

@@ -178,11 +178,13 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("Preset", _preset(run)),
     ]
     if "l_knee" in track.joint_names:
-        stature = settings.get("stature")
+        stature, ground = settings.get("stature"), settings.get("ground")
         told = f"{stature:g} m, as given" if stature else "not given; the size is known otherwise"
         if track.size_deviation:
             doubt = f"known to {100 * track.size_deviation:.0f} %"
             told = f"not given; it would set the size ({doubt}): --stature METRES, or --ground"
+            if ground is not None:
+                told = f"not given; the floor at {ground:g} m tells the size ({doubt})"
         facts.append(("Stature", told))
         facts.append(("Followed", f"--person {files.person}" if files else "not known"))
     return facts
