@@ -88,6 +88,21 @@ def test_names_of_any_signs(tmp_path: Path) -> None:
     assert "<script>" not in page
 
 
+def test_the_page_tells_where_the_clip_is_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def page(run: Run) -> None:
+        where = run.folder.resolve()
+        (run.folder / "report.html").write_text(f"<h1>torchcss: {where.name}</h1>smooth {where} #")
+
+    monkeypatch.setattr("torchcss.show.report.write_report_page", page)
+    manifest = write_manifest(tmp_path, {"name": "a", "stop": 1})
+    out = tmp_path / "out"
+    Batch(manifest=manifest, out=out, settings=replace(SETTINGS, overlay=True)).run()
+    told = (out / "a" / "report.html").read_text()
+    assert told == f"<h1>torchcss: a</h1>smooth {(out / 'a').resolve()} #"
+
+
 def test_what_is_half_written_is_not_gone_on_from(tmp_path: Path) -> None:
     """A process may be killed while it copies, and a disk may be full then."""
     place = tmp_path / "4"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from dataclasses import replace
-from html import unescape
+from html import escape, unescape
 from pathlib import Path
 
 import pytest
@@ -69,6 +69,19 @@ def test_the_verb_for_a_run_that_is_there(folder: Path) -> None:
     page = unescape((folder / "smooth_report.html").read_text())
     assert "torchcss smooth" not in page
     assert "say where with" in page  # the overlay is the track's, the video is gone
+
+
+def test_a_page_of_a_folder_that_is_moved(folder: Path, tmp_path: Path) -> None:
+    place = tmp_path / "an <other> 'place'"
+    page = report.write_report_page(Run.open(folder)).name
+    report.tell_new_place(folder, place)
+    moved = (folder / page).read_text()
+    folder.rename(place)
+    report.write_report_page(Run.open(place))
+    body, anew = (re.sub(r'"data:[^"]*"', "", text) for text in (moved, (place / page).read_text()))
+    # The video, which is nowhere, was in it.
+    assert body == anew.replace(escape(str(folder)), escape(str(place)))
+    report.tell_new_place(tmp_path, place)  # without a page
 
 
 def test_the_page_says_which_tracker_it_was(folder: Path) -> None:

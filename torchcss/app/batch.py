@@ -483,6 +483,11 @@ def track_claimed(job: Job, clip: Clip, claim: WorkClaim) -> None:
                     traceback.print_exc()
                     raise
             if claim.holds:
+                if job.settings.overlay:
+                    # Drawing figures takes long to import; who has made the page has done so.
+                    from torchcss.show.report import tell_new_place
+
+                    tell_new_place(place, job.out / clip.name)
                 _publish(place, job.out / clip.name)
     except TakenOver:
         return

@@ -106,11 +106,38 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
         ("What was read, assumed and fitted", _list(run.summary.get("notes", ()))),
         ("How to go on", f"<pre>{escape(_commands(run))}</pre>"),
     )
-    title = f"torchcss: {run.path.resolve().parent.name}"
     body = "\n".join(f"<h2>{name}</h2>\n{content}" for name, content in sections)
     name = REPORT_NAME if run.path.name == TRACK_NAME else f"{run.path.stem}_{REPORT_NAME}"
-    write_text(run.folder / name, _PAGE.format(title=escape(title), body=body))
+    write_text(run.folder / name, _PAGE.format(title=_title(run.folder), body=body))
     return run.folder / name
+
+
+def tell_new_place(folder: Path, place: Path) -> None:
+    """Let the page of a run say where its folder will be, before that is moved.
+
+    Args:
+        folder: Where it is; it may have no page.
+        place: Where it will be.
+
+    Raises:
+        OutputError: If the page cannot be written.
+    """
+    page = folder / REPORT_NAME
+    if not page.is_file():
+        return
+    text = page.read_text(encoding="utf-8")
+    for told in (_title, lambda where: escape(_quoted(where)), lambda where: escape(str(where))):
+        text = text.replace(told(folder.resolve()), told(place.resolve()))
+    write_text(page, text)
+
+
+def _title(folder: Path) -> str:
+    return escape(f"torchcss: {folder.resolve().name}")
+
+
+def _quoted(path: Path) -> str:
+    """A path as a shell takes it."""
+    return shlex.quote(str(path.resolve()))
 
 
 def _film(run: Run, *, anew: bool) -> str:
@@ -256,7 +283,7 @@ def _cameras(run: Run) -> list[tuple[str, str]]:
 def _commands(run: Run) -> str:
     """The commands that go on from this run."""
     path = run.folder if run.path.name == TRACK_NAME else run.path
-    where = shlex.quote(str(path.resolve()))
+    where = _quoted(path)
     lines = (
         ("smooth", "", "one smooth trajectory through the modes"),
         ("export", " --to bvh", "for Blender; trc, mot: OpenSim; csv, npz: with covariances"),
