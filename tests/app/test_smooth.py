@@ -332,6 +332,16 @@ def test_files_stay_and_the_summary_says_what_was_done(tmp_path: Path, body: Bod
     assert json.loads((elsewhere / "summary.json").read_text())["smoothed"]["path_switches"] == 0
 
 
+def test_the_summary_of_another_run_stays(tmp_path: Path, body: BodyModel) -> None:
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        save_track(tmp_path / name / "track.npz", noisy_track(body)[0])
+        write_summary(tmp_path / name, {"seed": name})
+    with pytest.raises(ConfigurationError, match="holds another run"):
+        smooth(tmp_path / "one", out=tmp_path / "other")
+    assert read_summary(tmp_path / "other") == {"seed": "other"}
+
+
 def test_one_line_for_a_missing_track(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert cli.main(["smooth", str(tmp_path / "nothing")]) == 2
     assert capsys.readouterr().err.count("\n") == 1

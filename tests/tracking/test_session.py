@@ -190,7 +190,8 @@ def test_a_new_run_replaces_what_belongs_to_the_last_one(clip: Path, tmp_path: P
     """And what fails before its first frame replaces nothing."""
     out = tmp_path / "out"
     run(clip, out)
-    for other in ("smooth.npz", "overlay.mp4", "overlay_2.mp4", "overlay_of_mine.mp4"):
+    made = ("smooth.npz", "overlay.mp4", "overlay_2.mp4", "report.html", "smooth_report.html")
+    for other in (*made, "overlay_of_mine.mp4"):
         (out / other).write_bytes(b"old")
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     with pytest.raises(ConfigurationError, match="descend"):

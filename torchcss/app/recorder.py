@@ -35,7 +35,6 @@ from torchcss.io.cameras import calibration
 from torchcss.io.checkpoint import Checkpoint, remove_checkpoint, write_checkpoint
 from torchcss.io.run import Run
 from torchcss.io.tracks import (
-    SMOOTH_NAME,
     TRACK_NAME,
     FrameModes,
     Track,
@@ -244,12 +243,16 @@ class Recorder:
     def _replace_last_run(self) -> None:
         """Remove what belongs to another track, now that there will be one in its place."""
         remove_checkpoint(self.folder)
-        for old in (self.folder / SMOOTH_NAME, *self.folder.glob("overlay*.mp4")):
-            if re.fullmatch("smooth|overlay(_[0-9]+)?", old.stem):
+        for old in sorted(self.folder.iterdir()):
+            if _OF_A_TRACK.fullmatch(old.name):
                 try:
                     old.unlink(missing_ok=True)
                 except OSError as error:
                     raise output_error(old, error) from error
+
+
+_OF_A_TRACK = re.compile(r"smooth\.npz|overlay(_[0-9]+)?\.mp4|(smooth_)?report\.html")
+"""Files that were made of a track."""
 
 
 def modes_of(frame: Posterior, *, is_first: bool = False) -> FrameModes:

@@ -71,6 +71,11 @@ def smooth(
             f"{run.path}: the smoothed track would replace it; give the track that it came from, "
             "or another folder with --out"
         )
+    if into.resolve() != run.folder.resolve() and (into / TRACK_NAME).is_file():
+        raise ConfigurationError(
+            f"{into}: holds another run, whose summary would be replaced; give another folder with "
+            "--out"
+        )
     track = run.track._replace(body=run.body)
     run = replace(run, track=track)
     done = _with_images(run, choice or IMAGES) if images else smooth_track(track, choice)
