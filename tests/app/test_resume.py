@@ -27,6 +27,7 @@ from torchcss.cli import main as cli
 from torchcss.errors import ConfigurationError, OutputError, TrackFileError
 from torchcss.io.run import Run
 from torchcss.io.video import VideoReader
+from torchcss.io.view_files import ViewFiles
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 
@@ -251,6 +252,36 @@ def test_other_settings_are_refused(clip: Path, whole: Run) -> None:
         follow(clip, whole.folder, replace(SETTINGS, samples=5), resume=True)
     with pytest.raises(ConfigurationError, match="stride 1, now 2"):
         follow(clip, whole.folder, stride=2, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sigma": 9.0}, "sigma .*, now 9.0"),
+        ({"person": "largest"}, "person prominent, now largest"),
+        ({"masks": Path("masks")}, "masks None, now masks"),
+        ({"others": [ViewFiles(video=Path("more.mp4"), keypoints=None)]}, "with 1 cameras"),
+    ],
+)
+def test_other_options_of_the_files_are_refused(
+    clip: Path, whole: Run, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        follow(clip, whole.folder, resume=True, **options)
+
+
+def test_another_camera_is_refused(clip: Path, whole: Run, tmp_path: Path) -> None:
+    content = json.loads((clip / "cameras.json").read_text())
+    for entry in content["cameras"].values():
+        entry["K"][0][0] += 1.0
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    for camera, focal in ((tmp_path / "cameras.json", None), (None, 500.0)):
+        with pytest.raises(ConfigurationError, match="begun with the camera"):
+            track_video(
+                clip / "video.mp4", camera=camera, keypoints=clip / "keypoints2d.npz",
+                out=whole.folder, settings=SETTINGS,
+                options=TrackOptions(resume=True, focal=focal),
+            )  # fmt: skip
 
 
 def test_other_files_are_refused(clip: Path, whole: Run, tmp_path: Path) -> None:

@@ -98,6 +98,7 @@ def test_one_clear_line(files: Path, what: str, capsys: pytest.CaptureFixture[st
     [
         ("--start", "9"),
         ("--stride", "0"),
+        ("--resume", "--overwrite"),
         ("--body", "octopus"),
         ("--preset", "magic"),
         ("--camera-name", "two"),

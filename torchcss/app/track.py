@@ -32,7 +32,7 @@ from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
 from torchcss.initialise.result import Initialisation, check_stature, stature_of
-from torchcss.io.cameras import LoadedCamera
+from torchcss.io.cameras import LoadedCamera, load_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.read import Scale
@@ -147,7 +147,7 @@ def track_video(
         if options.resume and (out / TRACK_NAME).is_file():
             begun = Run.open(out)
             if begun.checkpoint is not None:
-                begun = _with_files(begun, Path(video), keypoints, options)
+                begun = _with_files(begun, Path(video), camera, keypoints, options)
                 return _go_on(begun, settings, selection, options, lock)
         # What is wrong is told before the detector runs, which may take long.
         body = load_body(settings.body) if options.first is None else options.first.body
@@ -399,19 +399,67 @@ def _check_same(
         )
 
 
-def _with_files(run: Run, video: Path, keypoints: StrPath | None, options: TrackOptions) -> Run:
+def _with_files(
+    run: Run, video: Path, camera: StrPath | None, keypoints: StrPath | None, options: TrackOptions
+) -> Run:
     """The run with its files where they are now; others than it was begun with are refused."""
     assert run.checkpoint is not None
     known = run.checkpoint.notes["extra"].get("fingerprints", ())
     own = _files_of(video, keypoints, options)
     cameras = list(run.cameras)
     with naming(run.folder, ConfigurationError):
-        for place, given in enumerate((own, *options.others)[: len(cameras)]):
-            camera = cameras[place]
-            if camera.files is not None:
+        if len(options.others) >= len(cameras):
+            raise ConfigurationError(f"the run was begun with {len(cameras)} cameras, not more")
+        for place, given in enumerate((own, *options.others)):
+            recorded = cameras[place]
+            _check_camera(recorded.camera, given, camera, options)
+            if recorded.files is not None:
+                _check_same_options(recorded.files, given)
                 prints = known[place] if place < len(known) else {}
-                cameras[place] = camera._replace(files=camera.files.moved(given, prints))
+                cameras[place] = recorded._replace(files=recorded.files.moved(given, prints))
     return replace(run, track=run.track._replace(cameras=tuple(cameras)))
+
+
+_OF_VIEWS = ("layout", "normalised", "offset", "frame_rate", "person", "sigma")
+"""What else is said of a camera's files, once and for all."""
+
+
+def _check_same_options(files: ViewFiles, given: ViewFiles) -> None:
+    """Refuse to read the files of a run otherwise than it was begun with, where that is said."""
+    usual = ViewFiles(video=given.video, keypoints=None)
+    names = [*_OF_VIEWS, *(name for name in ("keypoints", "masks") if getattr(files, name) is None)]
+    other = [
+        f"{name} {getattr(files, name)}, now {getattr(given, name)}"
+        for name in names
+        if getattr(given, name) not in (getattr(usual, name), getattr(files, name))
+    ]
+    if other:
+        raise ConfigurationError(
+            f"the run was begun with {'; '.join(other)}; give the same, or leave --resume out to "
+            "start anew"
+        )
+
+
+def _check_camera(
+    known: Camera, given: ViewFiles, calibration: StrPath | None, options: TrackOptions
+) -> None:
+    """Refuse another camera than a run was begun with."""
+    lens = KnownLens(focal=options.focal, fov=options.fov)
+    if calibration is not None:
+        path = lens.unless(Path(calibration))
+        camera = load_camera(path, given.camera_name, video=given.video).camera
+    elif lens.is_known:
+        camera = lens.camera(*known.image_size_wh).camera
+    else:
+        return
+    pairs = zip(camera.buffers(), known.buffers(), strict=True)
+    if camera.image_size_wh != known.image_size_wh or not all(
+        torch.allclose(one, other) for one, other in pairs
+    ):
+        raise ConfigurationError(
+            f"the run was begun with the camera {known.name!r} as it was then, now {camera.name!r} "
+            "has other numbers; give the same, or leave --resume out to start anew"
+        )
 
 
 def _first_pose(

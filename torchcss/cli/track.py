@@ -74,6 +74,10 @@ class Track:
     def run(self) -> None:
         """Run the verb."""
         others = self.others()
+        if self.overwrite and self.options.resume:
+            raise ConfigurationError(
+                "--resume goes on with a run, --overwrite replaces it: give one of them"
+            )
         if (self.out / TRACK_NAME).is_file() and not (self.overwrite or self.options.resume):
             raise OutputError(
                 f"{self.out}: holds a run: --resume goes on with it where it was interrupted, "
