@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -80,12 +81,12 @@ def test_the_command_that_the_refusal_gives(
     out = ["--out", f"{recorded}/out"]
     assert cli.main([*given, "--camera", f"{recorded}/lens.json", *small, *out]) == 2
     told = capsys.readouterr().err.strip().splitlines()[-1]
-    folder = recorded / "straight"
+    folder = recorded / "made straight"
     command = told[told.index("torchcss undistort") : told.index(" makes straight")]
-    command = command.replace("FOLDER", str(folder)).split()
+    command = [str(folder) if word == "FOLDER" else word for word in command.split()]
     more = ["--keypoints", f"{recorded}/keypoints.npz", "--fov", "100"]
     assert cli.main([*command[1:], *more]) == 0
-    said = capsys.readouterr().out.strip().splitlines()[-1].split()
+    said = shlex.split(capsys.readouterr().out.strip().splitlines()[-1])
     assert said[:3] == ["torchcss", "track", f"{folder / 'wide.mp4'}"]
     assert cli.main([*said[1:], *small, *out]) == 0
     assert float(load_camera(folder / "cameras.json").camera.K[0, 0]) == pytest.approx(

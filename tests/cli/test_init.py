@@ -161,6 +161,15 @@ def test_clicked_joints_are_used_and_kept(
     assert f"focal length {focal:.0f} px" in summary["report"][0]
 
 
+def test_nobody_clicks_for_a_folder_that_cannot_be_written(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    monkeypatch.setattr("torchcss.show.click.click_joints", None)
+    (tmp_path / "out").write_text("a file")
+    assert init(scene, tmp_path / "out", "--click") == 2
+    assert "a file is in the way" in capsys.readouterr().err
+
+
 def test_from_a_frame_of_a_video(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """What is marked in a later frame is of that frame, for `track --start` too."""
     marks = json.loads((scene / "joints.json").read_text())["joints"]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from made_robots import planar_arm
+from matplotlib import pyplot
 from matplotlib.backend_bases import KeyEvent, MouseButton, MouseEvent
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_webagg_core import FigureCanvasWebAggCore, FigureManagerWebAgg
@@ -101,6 +104,22 @@ def test_a_notebooks_widget_answers_to_what_the_browser_sends():
     assert clicker.next_joint == CLICKED[2]
     send("key_press", key="kEnter")
     assert clicker.finished
+
+
+def test_keys_do_nothing_else_in_a_window():
+    figure, others = pyplot.figure(), []
+    canvas = figure.canvas
+    canvas.toolbar = SimpleNamespace(
+        save_figure=lambda: others.append("s"),
+        back=lambda: others.append("backspace"),
+        _wait_cursor_for_draw_cm=nullcontext,
+    )
+    clicker = JointClicker(PICTURE, figure=figure)
+    for key in ("s", "s", "backspace"):
+        type_key(clicker, key)
+    pyplot.close(figure)
+    assert clicker.places == [None]
+    assert others == []
 
 
 def test_clicks_beside_the_picture_count_for_nothing(clicker: JointClicker):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from made_clip import grey_film
 from made_tracks import make_track
 from matplotlib.figure import Figure
@@ -16,8 +17,10 @@ from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, TrackFileError
 from torchcss.io.tracks import Track
 from torchcss.show import track_plots
+from torchcss.show.overlay import PALETTE, ProjectedBody, draw_overlay
 from torchcss.show.style import save_figure
 from torchcss.studies.render.scene import look_at
+from torchcss.vision.camera import Camera
 
 
 def legend(figure: Figure) -> list[str]:
@@ -84,6 +87,36 @@ def test_a_reference_that_is_not_known_is_left_out(track: Track) -> None:
         track_plots.side_view_figure(track, 12, reference={"r_wrist": np.zeros(2)})
     with pytest.raises(ConfigurationError, match="frames 10 to 12"):
         track_plots.side_view_figure(track, 2)
+
+
+def test_what_is_behind_the_camera_is_not_seen_and_spoils_no_scale(track: Track) -> None:
+    points = np.array([[0.1, 0.2, 0.5], [0.1, 0.2, -0.5], [0.1, 0.2, 1e-9]])
+    np.testing.assert_allclose(
+        track_plots.in_perspective(points, 1.0), [[0.2, 0.4], [np.nan] * 2, [np.nan] * 2]
+    )
+    nearest = track.joints_world[0, 0, :, 2].min()
+    place = torch.tensor([0.0, 0.0, -float(nearest) - 1e-6], dtype=torch.float64)
+    camera = Camera(torch.eye(3), (1, 1), t_camera_world=place)
+    front = track_plots.side_view_figure(track, int(track.frames[0]), camera=camera).axes[0]
+    assert np.ptp(front.get_xlim()) < 20
+
+
+def test_other_modes_have_the_colours_of_the_overlay_however_many() -> None:
+    seven = len(PALETTE)
+    assert [track_plots.mode_colour(mode) for mode in (0, 1)] == [
+        tuple(part / 255 for part in PALETTE[mode]) for mode in (0, 1)
+    ]
+    assert (
+        track_plots.mode_colour(seven) == track_plots.mode_colour(1) != track_plots.mode_colour(0)
+    )
+    body = ProjectedBody(
+        torch.tensor([[4.0, 4.0], [28.0, 4.0], [4.0, 28.0]]), torch.ones(3),
+        torch.ones(3, dtype=torch.bool), torch.tensor([[0, 1, 2]]), torch.zeros(1).long(),
+    )  # fmt: skip
+    nobody = body._replace(valid=torch.zeros(3, dtype=torch.bool))
+    image = torch.zeros(32, 32, 3, dtype=torch.uint8)
+    drawn = [draw_overlay(image, [nobody] * number + [body]) for number in (1, seven)]
+    assert torch.equal(*drawn)
 
 
 def test_explanations_are_counted_by_distance(track: Track) -> None:

@@ -75,8 +75,8 @@ class Init:
             from torchcss.show.click import click_joints, write_clicked
 
             picture = read_frame(self.image, files.frame)
+            prepare_output_folder(self.out)  # before the work of clicking
             keypoints = click_joints(picture, body=self.body)
-            prepare_output_folder(self.out)
             size = (picture.shape[1], picture.shape[0])
             write_clicked(self.out / "joints.json", keypoints, size, frame=files.frame)
         proportions = PAPER_LENGTHS if self.proportions == "papers" else PROPORTIONS

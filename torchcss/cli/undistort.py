@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from torchcss.app.undistort import undistort_video
@@ -62,5 +63,7 @@ class Undistort:
             print(note)
         said = {".json": "--camera ", ".npz": "--keypoints "}
         video, *others = paths
-        options = (f"{said.get(path.suffix, '--masks ')}{path}" for path in others)
-        print(" ".join(["torchcss track", str(video), *options]))
+        options = (
+            f"{said.get(path.suffix, '--masks ')}{shlex.quote(str(path))}" for path in others
+        )
+        print(" ".join(["torchcss track", shlex.quote(str(video)), *options]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from torchcss.cli.options import GivenOptions, PathArgument
@@ -31,7 +32,7 @@ class View:
         if not has_pictures(run):
             print("without pictures: give --video (and --camera) to see what the modes explain")
         if self.save is not None:
-            print(f"wrote {self.save}; open it with: rerun {self.save}")
+            print(f"wrote {self.save}; open it with: rerun {shlex.quote(str(self.save))}")
 
 
 @frozen

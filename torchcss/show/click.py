@@ -103,6 +103,7 @@ class JointClicker:
             button = Button(figure.add_axes((0.3 + 0.15 * number, 0.02, 0.13, 0.05)), label)
             button.on_clicked(lambda _, action=action: action())
             self._buttons.append(button)
+        _take_keys_off(figure)
         figure.canvas.mpl_connect("button_press_event", self._pressed)  # type: ignore[arg-type]
         figure.canvas.mpl_connect("key_press_event", self._typed)  # type: ignore[arg-type]
         self._draw()
@@ -254,6 +255,13 @@ def write_clicked(
     marked = {"joints": places} if frame == 0 else {"frames": {str(frame): places}}
     content = {"image_size_wh": list(image_size_wh), **marked}
     write_text(Path(path), json.dumps(content, indent=2) + "\n")
+
+
+def _take_keys_off(figure: Figure) -> None:
+    """Take matplotlib's own keys off a window: `s` would save the figure, too."""
+    manager = figure.canvas.manager
+    if manager is not None and manager.key_press_handler_id is not None:
+        figure.canvas.mpl_disconnect(manager.key_press_handler_id)
 
 
 def _is_zooming(figure: Figure) -> bool:

@@ -52,7 +52,7 @@ def draw_hypotheses(
     seen = in_perspective(joints, distance) - in_perspective(middle, distance)
     joints, bones = joints - middle, bones_of(body)
     figure = Figure(figsize=(12, 5), layout="constrained")
-    extent = 1.05 * float(max(np.abs(joints).max(), np.abs(seen).max()))
+    extent = 1.05 * float(np.fmax(np.abs(joints).max(), np.nanmax(np.abs(seen))))
     for axes, (title, degrees) in zip(figure.subplots(1, 3), _VIEWS.items(), strict=True):
         turn = np.radians(degrees)
         across = np.cos(turn) * joints[..., 0] + np.sin(turn) * joints[..., 2]

@@ -50,6 +50,12 @@ _ORDER = ("sky", "orange", "purple", "green", "vermilion", "yellow", "blue")
 PALETTE = tuple(tuple(bytes.fromhex(OKABE_ITO[name].removeprefix("#"))) for name in _ORDER)
 """Colours of the modes, RGB, best mode first: Okabe and Ito's set without black."""
 
+
+def palette_colour(mode: int) -> tuple[int, ...]:
+    """The colour of the mode of a rank, RGB: the best one has its own, the others' come round."""
+    return PALETTE[1 + (mode - 1) % (len(PALETTE) - 1)] if mode else PALETTE[0]
+
+
 _RINGS, _MERIDIANS = 16, 20
 """Latitudes and longitudes of the mesh of a part."""
 
@@ -221,14 +227,15 @@ def draw_overlay(
         )
     drawn = image.clone()
     line = max(1.5, image.shape[0] / 320)
-    colours = drawn.new_tensor(PALETTE, dtype=torch.float32)
+    colours = drawn.new_tensor(
+        [palette_colour(mode) for mode in range(len(modes))], dtype=torch.float32
+    )
     if modes:
         _draw_body(drawn, modes[0], colours[0], line)
     for index in range(len(modes) - 1, 0, -1):  # the heavier on top
         share = float(strength[index] / strength[0]) if strength[0] > 0 else 0.0
         opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
-        colour = colours[1 + (index - 1) % (len(PALETTE) - 1)]
-        _draw_outline(drawn, modes[index], colour, 2 * line / 3, opacity)
+        _draw_outline(drawn, modes[index], colours[index], 2 * line / 3, opacity)
     if keypoints is not None:
         check_shape("keypoints", keypoints, None, 2)
         _draw_keypoints(drawn, keypoints, 2.5 * line)

@@ -5,7 +5,7 @@
 * `modes_figure`: weights of the modes, the number of explanations, and the cost over time.
 * `contact_sheet`: frames of a video, of an overlay for instance, with their times.
 
-Modes have the colours that they have in the overlay (`torchcss.show.overlay.PALETTE`), which
+Modes have the colours that they have in the overlay (`torchcss.show.overlay.palette_colour`), which
 colour-blind viewers can tell apart. Every function returns a figure that belongs to nobody;
 `torchcss.show.style.save_figure` writes it.
 """
@@ -33,7 +33,7 @@ from torchcss.io.run import body_of_track
 from torchcss.io.tracks import Track
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
-from torchcss.show.overlay import PALETTE
+from torchcss.show.overlay import palette_colour
 from torchcss.show.style import OKABE_ITO
 from torchcss.vision.camera import Camera
 
@@ -54,6 +54,9 @@ _FAINTEST = 0.45
 
 _SHEET_PX = 360
 """Width of the images of a contact sheet."""
+
+_NEAREST = 0.05
+"""Depth below which a point has no place in a perspective image, metres."""
 
 _SPACE = 0.08
 _NARROWEST = 0.6
@@ -391,13 +394,17 @@ def _first_of_links(body: BodyModel) -> list[int]:
 
 def mode_colour(mode: int) -> tuple[float, float, float]:
     """The colour of the mode of a rank, as in the overlay; red, green, blue from 0 to 1."""
-    red, green, blue = PALETTE[mode % len(PALETTE)]
+    red, green, blue = palette_colour(mode)
     return red / 255, green / 255, blue / 255
 
 
 def in_perspective(joints: np.ndarray, distance: float) -> np.ndarray:
-    """Perspective image of points of the camera's frame, in metres at a distance."""
-    return distance * joints[..., :2] / joints[..., 2:]
+    """Perspective image of points of the camera's frame, in metres at a distance.
+
+    NaN of points behind the camera or very near it, which it does not see.
+    """
+    depth = joints[..., 2:]
+    return distance * joints[..., :2] / np.where(depth > _NEAREST, depth, np.nan)
 
 
 def _same_scale(figure: Figure, front: Axes, side: Axes) -> None:

@@ -45,7 +45,7 @@ from torchcss.files import one_line, prepare_output_folder, replace_file
 from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.io.run import Run
 from torchcss.io.tracks import FrameModes
-from torchcss.show.overlay import PALETTE
+from torchcss.show.overlay import PALETTE, palette_colour
 from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_pictures import pictures_of
 from torchcss.show.track_plots import EXPLANATION_M, bones_of, check_not_empty, count_apart
@@ -280,7 +280,8 @@ class Viewer:
             self._introduce(mode)
         self._known = max(self._known, len(weight))
         for mode in range(len(weight)):
-            share = float(weight[mode] / weight[0]) if weight[0] > 0 else 1.0
+            # Of a tracker that runs the first is the cheapest, not always the heaviest.
+            share = min(float(weight[mode] / weight[0]), 1.0) if weight[0] > 0 else 1.0
             self._log_mode(mode, share, joints[mode], spread[mode], rotation[mode], centre[mode])
             nats = float(cost[mode]) if np.isfinite(cost[mode]) else np.nan
             self._log(f"cost/{mode}", self._rr.Scalars(nats))
@@ -317,7 +318,7 @@ class Viewer:
             )
             self._log(f"world/modes/{mode}/body/{name}", mesh, static=True)
         line = self._rr.SeriesLines(
-            colors=PALETTE[mode % len(PALETTE)],
+            colors=palette_colour(mode),
             names="best mode" if mode == 0 else f"mode {mode + 1}",
             widths=2.5 if mode == 0 else 1.2,
         )
@@ -352,7 +353,7 @@ class Viewer:
     ) -> None:
         """Log the joints and the parts of a mode, which weighs `share` as much as the best."""
         path = f"world/modes/{mode}"
-        opacity = _FAINTEST + (1 - _FAINTEST) * min(share, 1.0)
+        opacity = _FAINTEST + (1 - _FAINTEST) * share
         colour = _colour(mode, opacity)
         thickness = 1.0 if mode == 0 else 0.7
         strips = self._rr.LineStrips3D(
@@ -389,7 +390,7 @@ class Viewer:
 
 
 def _colour(mode: int, opacity: float) -> tuple[int, ...]:
-    return (*PALETTE[mode % len(PALETTE)], round(255 * opacity))
+    return (*palette_colour(mode), round(255 * opacity))
 
 
 def ellipsoids(
