@@ -427,10 +427,27 @@ def test_screening_is_the_edges_alone(generator: torch.Generator) -> None:
     """[RR] section 4.2."""
     cost = make_full_cost()
     x = random_states(cost.body, 3, generator=generator)
-    screened, whole = cost.screening().terms(x), cost.terms(x)
+    edges, whole = cost.screening(), cost.terms(x)
+    assert edges is not None
+    screened = edges.terms(x)
     assert set(screened) == {"contour", "edge_energy"}
     for name, value in screened.items():
         torch.testing.assert_close(value, whole[name])
+
+
+def test_without_edges_the_cost_itself_screens(generator: torch.Generator) -> None:
+    """Where nothing tells hypotheses apart, which are kept would be a matter of their order."""
+    cost = make_full_cost()
+    assert replace(cost, choice=JOINTS_ONLY).problem().screening is None
+    blind = changed(cost, edge_field=None, features=None)
+    assert blind.problem().screening is None
+
+
+def test_a_cost_without_terms_is_zero() -> None:
+    cost = make_cost(choice=NOTHING)
+    x = cost.body.rest.expand(3, -1)
+    assert torch.equal(cost.value(x), torch.zeros(3).double())
+    assert cost.terms(x) == cost.gradients(x) == {}
 
 
 def test_lengths_belong_to_the_anthropometric_prior(generator: torch.Generator) -> None:

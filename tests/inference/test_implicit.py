@@ -97,6 +97,12 @@ def test_weights_are_learnt_from_where_the_minimum_should_be() -> None:
     learnt = weights.factors()
     assert learnt["stabiliser"] > 2.5
     assert learnt["temporal"] < 0.5
+    # Terms that are not weighed keep the weights that they have.
+    heavy = cost.with_weights(true)
+    kept = OPTIMISER.minimise(heavy, wanted, bounds).mean
+    alone = TermWeights(("temporal",), {"temporal": true["temporal"]})
+    found = weighted_minimum(heavy, alone, wanted, bounds, optimiser=OPTIMISER)
+    torch.testing.assert_close(found.detach(), kept)
     # A term that the frame does not have is silent.
     silent = TermWeights(("flow", "temporal"))
     weighted_minimum(cost, silent, start, bounds).sum().backward()

@@ -143,8 +143,8 @@ class TrackingCost:
         return keypoints
 
     def with_weights(self, weights: Mapping[str, float]) -> TrackingCost:
-        """The same cost with further factors on named terms and priors (`CostChoice.weights`)."""
-        return replace(self, choice=replace(self.choice, weights=dict(weights)))
+        """The same cost with other factors on named terms and priors (`CostChoice.weights`)."""
+        return replace(self, choice=replace(self.choice, weights={**self.choice.weights, **weights}))
 
     def with_body(self, body: BodyModel) -> TrackingCost:
         """The cost of another body before the same cameras."""
@@ -226,10 +226,14 @@ class TrackingCost:
         cost = replace(self, choice=replace(self.choice, terms=terms))
         return cost if cost._says("image") else None
 
-    def screening(self) -> TrackingCost:
-        """The edges alone, by which [RR] section 4.2 scores sampled hypotheses for speed."""
+    def screening(self) -> TrackingCost | None:
+        """The edges alone, by which [RR] section 4.2 scores sampled hypotheses for speed.
+
+        None where they say nothing: all would score alike.
+        """
         edges = self.choice.only([term.name for term in self.choice.terms if term.screens])
-        return replace(self, choice=edges)
+        cost = replace(self, choice=edges)
+        return cost if cost._says("image") else None
 
     def _of_those(self, names: list[str]) -> TrackingCost | None:
         """The part of the cost that some terms make; None: there are none."""
@@ -255,9 +259,7 @@ class TrackingCost:
         self._check(x)
         if self.engine is not None:
             return self.engine.value(self, x)
-        return self._evaluated(
-            lambda part: {"": torch.stack(list(part.values().values())).sum(0)}, x
-        )[""]
+        return self._evaluated(lambda part: {"": part.value()}, x)[""]
 
     def held_value(self, x: States, found_at: States) -> Costs:
         """Cost in nats with the visibility and the assignments that other states have.
@@ -434,7 +436,12 @@ class _Part:
             with self.cost.timed(name):
                 value = scale * term.value(posed).sum(-1)
             values[name] = values.get(name, 0.0) + value
-        return values or {"none": self.x.new_zeros(len(self.x))}
+        return values
+
+    def value(self) -> Float[Tensor, " b"]:
+        """Cost of the samples."""
+        values = list(self.values().values())
+        return torch.stack(values).sum(0) if values else self.x.new_zeros(len(self.x))
 
     def gradients(self) -> dict[str, Tensor]:
         """Gradient of every prior and term."""

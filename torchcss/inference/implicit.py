@@ -41,7 +41,7 @@ class WeighedCost(CostFunction, Protocol):
     """A sum of named terms whose weights can be set; `torchcss.cost.total.TrackingCost` is one."""
 
     def with_weights(self, weights: Mapping[str, float]) -> Self:
-        """The same with further factors on named terms, one where none is given."""
+        """The same with other factors on named terms; those that are not named keep theirs."""
         ...
 
     def gradients(self, x: Vectors) -> Mapping[str, Vectors]:

@@ -65,7 +65,11 @@ class SearchProblem(NamedTuple):
         """The problem of some of the samples."""
         if self.restrict is not None:
             return self.restrict(items)
-        coarse, screening = (
-            None if cost is None else cost.take(items) for cost in (self.coarse, self.screening)
-        )
-        return self._replace(cost=self.cost.take(items), coarse=coarse, screening=screening)
+        relatives = {
+            name: None if cost is None else cost.take(items)
+            for name, cost in (
+                *(("coarse", self.coarse), ("screening", self.screening)),
+                *(("past", self.past), ("motion", self.motion)),
+            )
+        }
+        return self._replace(cost=self.cost.take(items), **relatives)
