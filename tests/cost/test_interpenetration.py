@@ -196,6 +196,29 @@ def test_pairs_that_touch_or_cannot_turn_are_left_out() -> None:
         assert (("l_clavicle", "r_clavicle") in found) == (name == "body34")
 
 
+def test_parts_on_slides_are_kept_apart(tmp_path: Path) -> None:
+    """Two carriages on one rail meet, although nothing turns between them."""
+    rows = ['<robot name="rails"><link name="rail"/>']
+    for name, place in (("left", -0.3), ("right", 0.3)):
+        rows.append(
+            f'<link name="{name}"><visual><geometry><sphere radius="0.1"/></geometry></visual>'
+            f'</link><joint name="{name}_slide" type="prismatic"><parent link="rail"/>'
+            f'<child link="{name}"/><origin xyz="{place} 0 0"/><axis xyz="1 0 0"/>'
+            '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+        )
+    path = tmp_path / "rails.urdf"
+    path.write_text("".join([*rows, "</robot>"]))
+    body = load_body(path)
+    pairs, x = InterpenetrationPairs(body), torch.tensor([[0.0, 0.0], [0.25, -0.25]]).double()
+    names = {body.part_names[part] for part in pairs.first.tolist()}
+    assert len(names) == pairs.num_pairs == 2
+    model = TERM.local_model(body, body.pose(x), pairs)
+    assert float(model.value[0]) == 0.0
+    assert float(model.value[1]) > 1.0
+    assert float(model.gradient[1, 1]) < 0.0 < float(model.gradient[1, 0])
+    assert_relative(model.hessian, by_autograd(TERM, body, x).hessian)
+
+
 def test_the_chain_runs_from_b_to_a() -> None:
     body = load_body("body34")
     pairs = InterpenetrationPairs(body)

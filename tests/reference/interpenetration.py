@@ -63,13 +63,13 @@ def potential(square: Tensor, p: float, sharpness: float, end: float) -> Tensor:
 
 
 def may_collide(body: BodyModel, a: int, b: int) -> bool:
-    """Whether the parts do not touch by construction, and some rotation lies between them."""
+    """Whether the parts do not touch by construction, and some joint but a length lies between."""
     names = body.part_names[a], body.part_names[b]
     if a == b or names in body.neighbours or names[::-1] in body.neighbours:
         return False
     for joint in range(body.tree.num_joints):
         moves = [bool(body.tree.ancestors[joint, body.part_link[part]]) for part in (a, b)]
-        if moves[0] != moves[1] and bool(body.tree.is_revolute[joint]):
+        if moves[0] != moves[1] and not body.tree.joint_names[joint].endswith("_length"):
             return True
     return False
 

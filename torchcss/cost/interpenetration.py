@@ -19,7 +19,7 @@ the push is strong from just outside the surface to deep inside and fades only a
 any p > 1 makes f |f|^(p-1) flat at the surface, so that nodes are not pushed all the way out.
 
 Pairs that touch in every pose (`BodyModel.neighbours`) are left out, and so are pairs between which
-no revolute joint lies: they cannot move against each other, other than by their lengths.
+no joint lies but those of lengths: they cannot move against each other in time.
 
 The cost of a pair depends on where the nodes are in B's frame, `y = R_B^T (p - c_B)`. Joints above
 both parts do not matter. The others form a chain that starts at B, climbs to the link where the
@@ -52,6 +52,7 @@ from torchcss.body.lift import point_moments, reactions
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_hessian
 from torchcss.body.surface import surface_points
+from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.errors import ConfigurationError
@@ -259,7 +260,9 @@ class InterpenetrationPairs(nn.Module):
 def _pairs(body: BodyModel) -> list[tuple[int, int, list[int], list[int]]]:
     """Part A, part B, the joints from B to A and their signs, for all pairs that may collide."""
     tree, links = body.tree, body.part_link.tolist()
-    above, revolute = tree.ancestors.cpu(), tree.is_revolute.cpu()
+    above = tree.ancestors.cpu()
+    lengths = list(proportion_columns(body).values())
+    moving = ~(body.tie[:, lengths] != 0).any(1).cpu()
     depth = tree.joint_ancestors.sum(0).tolist()
     touching = {frozenset(pair) for pair in body.neighbours}
     found = []
@@ -267,7 +270,7 @@ def _pairs(body: BodyModel) -> list[tuple[int, int, list[int], list[int]]]:
         for b, name_b in enumerate(body.part_names):
             moves_a, moves_b = above[:, links[a]], above[:, links[b]]
             between = moves_a ^ moves_b
-            if {name_a, name_b} in touching or not bool((between & revolute).any()):
+            if {name_a, name_b} in touching or not bool((between & moving).any()):
                 continue
             up = sorted((moves_b & between).nonzero()[:, 0].tolist(), key=lambda j: -depth[j])
             down = sorted((moves_a & between).nonzero()[:, 0].tolist(), key=lambda j: depth[j])
