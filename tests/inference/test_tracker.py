@@ -446,6 +446,21 @@ def test_soft_matching_hands_no_past_to_who_is_far_from_it(generator):
     assert torch.equal(state.velocity[1], torch.zeros_like(state.velocity[1]))
 
 
+@pytest.mark.parametrize("soft_matching", [False, True])
+def test_where_all_is_forgotten_an_empty_place_is_nobodys_parent(soft_matching, generator):
+    well = problems.DoubleWell()
+    before = GaussianMixture(
+        well.minima[[0, 0]],
+        0.01 * torch.eye(2).double().expand(2, 2, 2),
+        torch.tensor([-torch.inf, 0.0]).double(),
+    )
+    tracker = replace(CSS, forgetting=0.0, soft_matching=soft_matching, num_modes=1)
+    start = tracker.init(before, generator=generator)
+    start = start._replace(mixture=before)
+    _, info = tracker.step(start, SearchProblem(well), BOUNDS)
+    assert info.parent.tolist() == [1]
+
+
 @dataclass(frozen=True)
 class AfterModes(problems.Alike):
     """What a frame says, and what the modes before make likely."""

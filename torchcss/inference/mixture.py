@@ -444,7 +444,8 @@ def prior_at(
     c / n: what the prior on motion lacks is wrong for many frames, as an acceleration is.
 
     Other than in `match_to_prior`, no mode can take a component's weight from another, and none is
-    handed the weight of a component that merely was left over.
+    handed the weight of a component that merely was left over. Prior components of weight zero are
+    not there.
 
     Args:
         posterior: The modes of this frame.
@@ -454,12 +455,12 @@ def prior_at(
     Raises:
         ShapeError: If the mixtures are over different states.
     """
-    n = _same_state("prior_at", posterior, prior)
+    n, prior = _same_state("prior_at", posterior, prior), prior.normalise()
     apart = posterior.mean[:, None] - prior.mean[None, :]
     both = posterior.covariance[:, None] + prior.covariance[None, :]
     distance = (squared_mahalanobis(apart, both) / (2 * n)).clamp(max=1.0)
-    nearest = distance.min(-1)
+    nearest = torch.where(prior.log_weight > -torch.inf, distance, 1.0).min(-1)
     return Past(
-        (prior.normalise().log_weight - min(n, surprise) * distance).logsumexp(-1),
+        (prior.log_weight - min(n, surprise) * distance).logsumexp(-1),
         torch.where(nearest.values < 1, nearest.indices, -1),
     )

@@ -541,7 +541,9 @@ class Tracker(SequenceTracker):
         told = torch.zeros_like(cost) if problem.past is None else problem.past.value(modes.mean)
         log_weight = -self.likelihood_power * cost
         unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
-        remembered = self.forgetting * prior.mixture.normalise().log_weight
+        weight = prior.mixture.normalise().log_weight
+        # An empty place stays one, also where all is forgotten.
+        remembered = torch.where(weight > -torch.inf, self.forgetting * weight, -torch.inf)
         tempered = prior.mixture._replace(log_weight=remembered)
         past = None
         if self.soft_matching:
