@@ -13,12 +13,21 @@ import pytest
 import torch
 from made_sequences import rendered_arm
 from made_sessions import seen_by, session_at, start_at
+from problems import single
 
 import torchcss
 from torchcss.app.recorder import Recorder
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import Kind, OnStates, Posed, Term
 from torchcss.inference.loss_monitor import LossMonitor
+from torchcss.inference.proposals import (
+    CovarianceScaled,
+    HeavyTailed,
+    InflatedPosterior,
+    ScaledProposal,
+    Spherical,
+)
+from torchcss.inference.tracker import Tracker
 from torchcss.io.view_files import RecordedCamera
 from torchcss.studies.render.sequences import SyntheticSequence
 from torchcss.tracking.recovery import Recovery
@@ -158,6 +167,17 @@ def test_only_what_compares_with_the_image_is_judged(sequence: SyntheticSequence
     assert posterior.terms["constant"] == 1.0
     assert session.state.monitor is not None
     assert set(session.state.monitor.history) == {"contour"}
+
+
+@pytest.mark.parametrize("name", ["covariance_scale", "deviation_scale"])
+@pytest.mark.parametrize("kind", [CovarianceScaled, HeavyTailed, Spherical, InflatedPosterior])
+def test_a_wide_search_has_larger_covariances(kind: type[ScaledProposal], name: str):
+    tracker = Tracker(proposal=kind(**{name: 3.0}), num_samples=5, num_modes=2)
+    wide = RECOVERY.widened(tracker)
+    assert isinstance(wide, Tracker)
+    mixture = single()
+    shapes = [each.proposal.law(mixture).mixture.covariance for each in (tracker, wide)]
+    torch.testing.assert_close(shapes[1], RECOVERY.scale * shapes[0])
 
 
 def test_every_term_of_the_images_is_judged():

@@ -38,7 +38,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -320,7 +320,7 @@ class _RandomProposal(Proposal):
 
 
 @frozen
-class _ScaledProposal(_RandomProposal):
+class ScaledProposal(_RandomProposal):
     """A random proposal with one factor on the modes' spread.
 
     Attributes:
@@ -346,9 +346,15 @@ class _ScaledProposal(_RandomProposal):
             )
         return given[0] if self.covariance_scale is None else math.sqrt(given[0])
 
+    def widened(self, scale: float) -> Self:
+        """The same with its factor on the covariance so many times as large."""
+        if self.covariance_scale is not None:
+            return replace(self, covariance_scale=scale * self.covariance_scale)
+        return replace(self, deviation_scale=math.sqrt(scale) * self._factor)
+
 
 @frozen
-class CovarianceScaled(_ScaledProposal):
+class CovarianceScaled(ScaledProposal):
     """Sample every mode's Gaussian, inflated: `N(mu_i, s Sigma_i)`, Fig. 6 step 1.
 
     Attributes:
@@ -374,7 +380,7 @@ class CovarianceScaled(_ScaledProposal):
 
 
 @frozen
-class HeavyTailed(_ScaledProposal):
+class HeavyTailed(ScaledProposal):
     """Sample a Student t of every mode: mostly near, sometimes very far.
 
     Attributes:
@@ -406,7 +412,7 @@ class HeavyTailed(_ScaledProposal):
 
 
 @frozen
-class Spherical(_ScaledProposal):
+class Spherical(ScaledProposal):
     """Sample a ball of the same volume as each mode's ellipsoid: the paper's control, Table 1.
 
     The ball's standard deviation is the geometric mean of those along the covariance's
@@ -496,7 +502,7 @@ class ChamRehg(_RandomProposal):
 
 
 @frozen
-class InflatedPosterior(_ScaledProposal):
+class InflatedPosterior(ScaledProposal):
     """Sample the posterior raised to the power 1/s, then noise: section 9 [IJRR].
 
     To that power, a mode's Gaussian `pi N(mu, Sigma)` has the covariance `s Sigma` and the weight

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
-from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
+from torchcss.inference.proposals import ScaledProposal
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.types import frozen
 
@@ -27,7 +27,7 @@ class Recovery:
         monitor: Tells a loss from the costs.
         samples: How many times as many samples.
         modes: How many times as many modes.
-        scale: Factor on the covariance scale.
+        scale: Factor on the covariance scale, for proposals that have one.
         num_flips: Most flips of the best mode that are searched, see
             `torchcss.tracking.flip_moves`.
         patience: Frames in a row that are searched widely. What is not found by then has left, or
@@ -53,7 +53,6 @@ class Recovery:
         if not isinstance(tracker, Tracker):
             return tracker
         proposal = tracker.proposal
-        scaled = isinstance(proposal, (CovarianceScaled, HeavyTailed))
-        if scaled and proposal.covariance_scale is not None:
-            proposal = replace(proposal, covariance_scale=self.scale * proposal.covariance_scale)
+        if isinstance(proposal, ScaledProposal):
+            proposal = proposal.widened(self.scale)
         return replace(tracker, proposal=proposal, forgetting=0.0, soft_matching=False)
