@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -162,6 +162,24 @@ def test_nothing_is_lost_when_one_fails(films: list[SyntheticSequence]) -> None:
     for posterior in torchcss.track_batch([(good, film.frames[2:])]):
         assert posterior[0] is not None
     assert int(good.state.tracker.frame) == 3
+
+
+def test_a_film_that_cannot_be_read_on_keeps_no_other_waiting(
+    films: list[SyntheticSequence],
+) -> None:
+    film = films[1]
+    good, bad = (session_of(film, seed, engine="eager") for seed in (0, 1))
+
+    def broken() -> Iterator[np.ndarray]:
+        yield film.frames[0]
+        raise VideoError("no more")
+
+    moments = torchcss.track_batch([(good, film.frames), (bad, broken())])
+    next(moments)
+    with pytest.raises(VideoError, match="no more"):
+        next(moments)
+    assert int(good.state.tracker.frame) == 2
+    assert int(bad.state.tracker.frame) == 1
 
 
 def test_what_fails_in_an_evaluation_is_told_to_those_who_asked(

@@ -61,24 +61,35 @@ def track_batch(sequences: Sequences) -> Iterator[tuple[Posterior | None, ...]]:
     set_up = partial(torch.set_num_threads, torch.get_num_threads())
     with ThreadPoolExecutor(len(sessions), "sequence", initializer=set_up) as pool:
         while True:
-            moment = [next(its, None) for its in images]
+            moment = [_next(its) for its in images]
             if all(each is None for each in moment):
                 return
             yield _step(pool, sessions, moment)
 
 
+def _next(images: Iterator[Images]) -> Images | Exception | None:
+    """The images of the next moment; None after the last, and what is wrong if they fail."""
+    try:
+        return next(images, None)
+    except Exception as error:
+        return error
+
+
 def _step(
-    pool: ThreadPoolExecutor, sessions: Sequence[TrackingSession], moment: list[Images | None]
+    pool: ThreadPoolExecutor,
+    sessions: Sequence[TrackingSession],
+    moment: list[Images | Exception | None],
 ) -> tuple[Posterior | None, ...]:
     """One moment of all sequences that have not ended."""
     going = [number for number, images in enumerate(moment) if images is not None]
     collector, enabled = _Collector(len(going)), torch.is_grad_enabled()
 
     def search(number: int) -> Posterior:
-        images = moment[number]
+        images, session = moment[number], sessions[number]
         assert images is not None
-        session = sessions[number]
         try:
+            if isinstance(images, Exception):
+                raise images
             with torch.set_grad_enabled(enabled):
                 seen = session.observe(images)
                 return session.step(seen, partial(collector.collecting, number))
