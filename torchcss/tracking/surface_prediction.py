@@ -29,9 +29,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchcss.body.catalog import PROPORTIONS
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
+from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.surface import SurfaceTargets, SurfaceTerm, surface_targets
 from torchcss.cost.visibility import facing_nodes, seen_nodes
@@ -313,7 +313,8 @@ def trunk_of(body: BodyModel) -> tuple[Items, Bool[Tensor, " parts"]]:
     # Which parameter moves which part.
     moves = (body.tie != 0).mT.double() @ body.tree.ancestors[:, body.part_link].double() > 0
     # Lengths move parts as well, but not in time.
-    angles = torch.tensor([name not in PROPORTIONS for name in body.state_names]).to(moves)
+    angles = torch.ones(len(moves), dtype=torch.bool, device=moves.device)
+    angles[list(proportion_columns(body).values())] = False
     both = (moves & sides[0]).any(-1) & (moves & sides[1]).any(-1)
     shared = both & angles & has_root(body)
     parts = ~moves[angles & ~shared].any(0) & shared.any()
