@@ -6,6 +6,7 @@ import math
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -515,6 +516,22 @@ def test_two_threads_give_the_same_bits(num_frames: int):
     for one, two in zip(*tracks, strict=True):
         for part, same in zip(one.state.mixture, two.state.mixture, strict=True):
             assert torch.equal(part, same)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_who_stops_on_the_way_goes_on_from_there(threads: int):
+    sequence = rendered_arm(0, 4)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2, threads=threads)
+    view = seen_by(sequence.camera, sequence.joints_world, sequence.body.joint_names)
+    whole, parts = (session_at(settings, sequence.body, sequence.states[0], view) for _ in range(2))
+    expected = list(whole.track(sequence.frames))
+    (first,) = islice(parts.track(sequence.frames), 1)
+    with pytest.raises(TorchcssError):
+        parts.observe(np.arange(2 * 480 * 640, dtype=np.uint8).reshape(480, 640, 2))
+    got = [first, *parts.track(sequence.frames[1:])]
+    for one, other in zip(got, expected, strict=True):
+        assert one.frame.index == other.frame.index
+        assert torch.equal(one.state.mixture.mean, other.state.mixture.mean)
 
 
 def test_torch_works_in_one_thread_beside_the_kernels():

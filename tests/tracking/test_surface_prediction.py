@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from typing import Literal
 
 import numpy as np
 import pytest
 import torch
-from made_sessions import seen_by, session_at
+from made_sessions import seen_by, session_at, start_at
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,8 +21,8 @@ from torchcss.errors import ConfigurationError
 from torchcss.inference.dynamics import ConstantVelocity, Diffusion
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.studies.render.renderer import Lighting, Mesh, random_texture, render_meshes
-from torchcss.tracking.session import Posterior
-from torchcss.tracking.settings import Settings
+from torchcss.tracking.session import Posterior, TrackingSession
+from torchcss.tracking.settings import Settings, make_plan
 from torchcss.tracking.surface_prediction import (
     PicturePair,
     SurfaceCost,
@@ -338,6 +339,11 @@ def test_only_a_body_with_a_root_has_a_trunk() -> None:
     assert not any(name.startswith(("l_", "r_", "neck")) for name in names)
     carrying = {name for name, held in zip(the_body().part_names, parts, strict=True) if held}
     assert carrying == {"pelvis", "chest"}
+    # Lengths move parts as well, but not in time.
+    free = load_body("body34", free_proportions=True)
+    columns, parts = trunk_of(free)
+    assert [free.state_names[i] for i in columns] == names
+    assert {name for name, held in zip(free.part_names, parts, strict=True) if held} == carrying
 
 
 def test_dynamics_of_the_surface_spread_as_the_others() -> None:
@@ -355,6 +361,25 @@ def test_dynamics_of_the_surface_spread_as_the_others() -> None:
             blind.predict(mixture, velocity), inner.predict(mixture, velocity), strict=True
         ):
             assert torch.equal(part, same)
+
+
+def test_the_plan_of_a_session_says_whether_surfaces_predict(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = []
+    monkeypatch.setattr(
+        SurfaceMotion, "__call__", lambda *_, expected, **__: asked.append(expected) or expected
+    )
+    settings = Settings(terms=("contour",), samples=2, modes=1, recovery=False, working_size=160)
+    body, x, view = the_body(), poses(), seen_by(the_camera())
+    image = (255 * picture(x[0])).byte()[..., None].expand(-1, -1, 3).numpy()
+    for planned in (True, False):
+        setting = replace(settings, prediction="velocity" if planned else "surface")
+        plan = make_plan(setting, body, view, INTERVAL)._replace(surface_prediction=planned)
+        asked.clear()
+        session = TrackingSession(setting, start_at(body, x), view, plan=plan)
+        next(session.track([image]))
+        assert len(asked) == planned
 
 
 def test_the_setting_is_checked() -> None:

@@ -144,7 +144,9 @@ class TrackingCost:
 
     def with_weights(self, weights: Mapping[str, float]) -> TrackingCost:
         """The same cost with other factors on named terms and priors (`CostChoice.weights`)."""
-        return replace(self, choice=replace(self.choice, weights={**self.choice.weights, **weights}))
+        return replace(
+            self, choice=replace(self.choice, weights={**self.choice.weights, **weights})
+        )
 
     def with_body(self, body: BodyModel) -> TrackingCost:
         """The cost of another body before the same cameras."""

@@ -272,7 +272,7 @@ class TrackingSession:
         self._observers = [self.plan.observer(body, view) for view in views]
         self._bounds = self.plan.bounds
         self._prior_variance = default_prior_variance(self._bounds)
-        self._surface_motion = SurfaceMotion(body) if settings.prediction == "surface" else None
+        self._surface_motion = SurfaceMotion(body) if self.plan.surface_prediction else None
 
     def checkpoint(self) -> SessionState:
         """All that the next frame needs; see `torchcss.tracking.checkpoint` for its tensors."""
@@ -281,17 +281,25 @@ class TrackingSession:
     def track(self, images: Iterable[Images]) -> Iterator[Posterior]:
         """Track through a sequence; with two threads the next images are seen meanwhile.
 
+        Who stops on the way may go on with another call, from the moment after the last one that
+        was yielded. An iterator has given its next one away by then, where there are two threads.
+
         Args:
             images: The images of one moment after another.
 
         Yields:
             What is known after each of them.
         """
-        if self.settings.threads < 2:
-            for each in images:
-                yield self.step(self.observe(each))
-            return
-        coming = iter(images)
+        try:
+            if self.settings.threads < 2:
+                yield from (self.step(self.observe(each)) for each in images)
+            else:
+                yield from self._track_seeing_ahead(iter(images))
+        finally:
+            self._expect(self.state)  # what was seen ahead is seen anew
+
+    def _track_seeing_ahead(self, coming: Iterator[Images]) -> Iterator[Posterior]:
+        """The same, each moment seen while the one before is searched."""
 
         def see() -> Observation | None:
             each = next(coming, None)
@@ -322,16 +330,20 @@ class TrackingSession:
             given = (images,) if isinstance(images, Image) else tuple(images)
             pairs = zip_longest(given, self._observers)
             frames = [self._placed(image, observer) for image, observer in pairs]
-            self._num_seen += 1
             everywhere: ViewWindows = (None,) * len(frames)
-            windows = self._ahead.popleft() if self._ahead else everywhere
+            known = bool(self._ahead)
+            windows = self._ahead[0] if known else everywhere
             assert frames[0] is not None
             times = (*self._times, frames[0].time_s)
             # Windows are for two intervals: what comes later may be beyond them.
             if sum(self._intervals(*pair) for pair in pairwise(times)) > 2.5:
                 windows = everywhere
-            self._times.append(times[-1])
             self._seen = tuple(map(Observer.observe, self._observers, frames, self._seen, windows))
+            # Images that cannot be seen have raised by here, and do not count.
+            self._num_seen += 1
+            self._times.append(times[-1])
+            if known:
+                self._ahead.popleft()
             return Observation(self._seen, time.perf_counter() - began)
 
     def _placed(self, image: Image | None, observer: Observer | None) -> Frame | None:
