@@ -6,7 +6,8 @@ A few frames are tracked with all default terms; of the last one the states that
 are kept, with the modes that they came from. At these states value, gradient and Hessian are
 evaluated by every engine in turn, in pools of several sizes, and the processor time of this thread
 is taken; ratios are taken within a repeat. Printed are medians over repeats. The first line says by
-how much the engines differ.
+how much the engines differ. The fused engine's value alone stands beside them, and its value with
+the visibility and the matches of the pool's first state.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -95,6 +97,11 @@ def visited(config: Config) -> tuple[TrackingCost, Tensor]:
     return cost.take(order), x[order]
 
 
+def from_first(cost: TrackingCost, x: Tensor) -> Tensor:
+    """Cost with the visibility and the matches of the first state."""
+    return cost.held_value(x, x[:1].expand_as(x))
+
+
 def microseconds(evaluate: Callable[[Tensor], Any], x: Tensor) -> float:
     """Processor time of one evaluation, the mean of a call."""
     began = time.thread_time()
@@ -109,11 +116,15 @@ def main(config: Config) -> dict[str, Any]:
     print(f"{cost.body.name}, {len(x)} states visited, terms: "
           f"{', '.join(term.name for term in cost.choice.terms)}")  # fmt: skip
     by_autograd = replace(cost.choice, curvature=Curvature.AUTOGRAD)
+    fused = replace(cost, engine=FusedEngine("float32"))
     engines = {
         "eager": cost,
-        "fused": replace(cost, engine=FusedEngine("float32")),
+        "fused": fused,
         "fused, float64": replace(cost, engine=FusedEngine("float64")),
+        "fused, value": fused,
+        "fused, value, matches held": fused,
     }
+    asked = {"fused, value": TrackingCost.value, "fused, value, matches held": from_first}
     if config.autograd:
         engines["autograd"] = replace(cost, choice=by_autograd)
     rows, eager = [], cost.local_model(x)
@@ -123,8 +134,9 @@ def main(config: Config) -> dict[str, Any]:
     for pool in config.pools:
         sizes = {name: pool if name != "autograd" else config.autograd for name in engines}
         ways = {name: engines[name].take(torch.arange(size)) for name, size in sizes.items()}
+        ask = {name: asked.get(name, TrackingCost.local_model) for name in engines}
         for name, way in ways.items():
-            way.local_model(x[: sizes[name]])
+            ask[name](way, x[: sizes[name]])
         rounds = []
         for repeat in range(config.repeats):
             states = x.roll(repeat * pool, 0)
@@ -133,7 +145,7 @@ def main(config: Config) -> dict[str, Any]:
                 for name, size in sizes.items()
                 if name != "autograd" or repeat < 3
             }
-            rounds.append({n: microseconds(w.local_model, states[: sizes[n]])
+            rounds.append({n: microseconds(partial(ask[n], w), states[: sizes[n]])
                            for n, w in ways.items()})  # fmt: skip
         for name in engines:
             taken = [times[name] for times in rounds if name in times]

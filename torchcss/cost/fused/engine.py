@@ -223,7 +223,9 @@ class FusedEngine:
             for index in (cost.parent, cost.component)
         )
         component = parent if component is None else component
-        sane = np.logical_and.reduce([np.isfinite(x).all(1) for x in each])
+        sane = np.isfinite(each[0]).all(1)
+        if len(each) > 1:
+            sane &= np.isfinite(each[1]).all(1)
         left_out: set[str] = set()
         for past in cost.past:
             items = None
