@@ -14,10 +14,14 @@ from PIL import ExifTags, Image
 
 import torchcss
 from torchcss.app.lens import KnownLens
+from torchcss.app.track import TrackOptions, _camera_of
+from torchcss.app.view_files import FrameSelection, open_view
 from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.errors import CameraError
+from torchcss.io.cameras import LoadedCamera
 from torchcss.io.video import focal_length_35mm
+from torchcss.io.view_files import ViewFiles
 from torchcss.studies.sequence_writer import write_camera
 
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
@@ -68,6 +72,16 @@ def test_pictures_say_it_by_exif(tmp_path: Path) -> None:
     assert focal_length_35mm(tmp_path) == 28
     Image.new("RGB", (64, 48)).save(tmp_path / "0.jpg")
     assert focal_length_35mm(tmp_path) is None
+
+
+def test_pictures_before_the_first_may_be_of_another_size(tmp_path: Path) -> None:
+    for number, size in enumerate(((64, 48), (32, 24), (32, 24))):
+        Image.new("RGB", size).save(tmp_path / f"{number}.png")
+    camera, _ = _camera_of(tmp_path, None, TrackOptions(), 1)
+    assert isinstance(camera, LoadedCamera)
+    given = ViewFiles(video=tmp_path, keypoints=None)
+    seen = open_view(given, camera, FrameSelection(start=1)).camera.camera
+    assert seen.image_size_wh == (32, 24)
 
 
 def test_a_camera_is_said_once() -> None:

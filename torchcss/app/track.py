@@ -154,7 +154,7 @@ def track_video(
         check_stature(settings.body, settings.stature)
         if keypoints is None:
             _check_for_detector(body)
-        source, is_known = _camera_of(Path(video), camera, options)
+        source, is_known = _camera_of(Path(video), camera, options, start)
         files = _files_of(Path(video), keypoints, options)
         files = _with_keypoints(files, source, out, selection, options)
         views = _all_views(files, source, selection, options, body.joint_of_name)
@@ -280,13 +280,14 @@ def _detect_further(run: Run, selection: FrameSelection, options: TrackOptions) 
 
 
 def _camera_of(
-    video: Path, camera: StrPath | None, options: TrackOptions
+    video: Path, camera: StrPath | None, options: TrackOptions, start: int
 ) -> tuple[Path | LoadedCamera, bool]:
     """The calibration file or the camera, and whether its focal length is known."""
     lens = KnownLens(focal=options.focal, fov=options.fov)
     if camera is not None:
         return lens.unless(Path(camera)), True
-    lens, info = lens.of(video), VideoReader(video).info
+    # Pictures before the first one to be tracked may be of another size.
+    lens, info = lens.of(video), VideoReader(video, start=max(start, 0)).info
     return lens.camera(info.width, info.height), lens.is_known
 
 
