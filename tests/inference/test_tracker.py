@@ -281,6 +281,9 @@ def test_a_move_finds_the_other_well_and_parents_are_modes_of_the_frame_before(g
 
 
 def test_bad_input(generator):
+    for power in (0.0, -1.0, torch.inf):
+        with pytest.raises(ConfigurationError, match=r"Tracker\.likelihood_power: expected"):
+            replace(CSS, likelihood_power=power)
     with pytest.raises(ConfigurationError, match="num_samples"):
         Tracker(proposal=CSS.proposal, num_samples=0, num_modes=1)
     with pytest.raises(ShapeError, match=r"mixture.covariance.*\[..., 1, 2, 2\]"):

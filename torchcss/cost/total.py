@@ -27,6 +27,7 @@ sequence is the case of one.
 | `joints` | 2D joint correspondences | 5 |
 | `anthropometric` | lengths of the limbs, where they are free | 3.2.1 |
 | `stabiliser` | long-tailed priors on what is hard to see | 3.2.2 |
+| `pose_prior` | poses that people take, learnt from motion capture | ours |
 | `interpenetration` | repulsion between parts | 3.2.4 |
 | `temporal` | near the sample's parent mode | 3.4, eq. 10 |
 | `temporal_mixture` | near any mode of the previous frame | 3.4, eq. 10 |

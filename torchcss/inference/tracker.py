@@ -361,10 +361,10 @@ class Tracker(SequenceTracker):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(self, "oversampling")
+        check_positive(self, "oversampling", "surprise")
+        check_positive(self, "likelihood_power", finite=True)
         if not 0 <= self.forgetting <= 1:
             raise ConfigurationError(f"Tracker.forgetting: expected 0 to 1, got {self.forgetting}")
-        check_positive(self, "surprise")
 
     @property
     def stated_power(self) -> float:
