@@ -490,8 +490,9 @@ class AfterModes(problems.Alike):
         return SearchProblem(well, of_children=children)
 
 
+@pytest.mark.parametrize("soft", [True, False])
 @pytest.mark.parametrize("power", [0.1, 1.0])
-def test_the_past_counts_once(power, generator):
+def test_the_past_counts_once(power, soft, generator):
     """The prior in the cost guides descents; weights are those of a cost without it."""
     well = problems.DoubleWell()
     before = GaussianMixture(
@@ -499,7 +500,7 @@ def test_the_past_counts_once(power, generator):
         torch.diag_embed(torch.tensor([[0.01, 0.01], [0.04, 0.04]]).double()),
         torch.tensor([0.6, 0.4]).double().log(),
     )
-    tracker = replace(CSS, soft_matching=True, likelihood_power=power)
+    tracker = replace(CSS, soft_matching=soft, likelihood_power=power)
     start = tracker.init(before, generator=generator)
     runs = [
         list(problems.follow(tracker, start, [frame] * 12, BOUNDS))

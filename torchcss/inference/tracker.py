@@ -546,14 +546,15 @@ class Tracker(SequenceTracker):
         remembered = torch.where(weight > -torch.inf, self.forgetting * weight, -torch.inf)
         tempered = prior.mixture._replace(log_weight=remembered)
         past = None
+        # It takes the place of what the cost says of the past, which else would count twice.
         if self.soft_matching:
             past = prior_at(unpruned, tempered, self.surprise)
-            # It takes the place of what the cost says of the past, which else would count twice.
             past = past._replace(log_weight=past.log_weight + self.likelihood_power * told)
         kept = self._explanations(problem, unpruned, -cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
             past = match_to_prior(pruned, tempered)
+            past = past._replace(log_weight=past.log_weight + self.likelihood_power * told[kept])
         else:
             past = Past(*(part[kept] for part in past))
         wide = self._marginal(state.mixture, prior, found, kept, past.parent, bounds)
