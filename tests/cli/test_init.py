@@ -93,6 +93,9 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
     assert "the fitted body is arm8" in capsys.readouterr().err
     assert cli.main([*given, "--body", "arm8", "--stature", "2", "--overwrite"]) == 2
     assert "the stature is said to be 2 m" in capsys.readouterr().err
+    for option, there in (("--ground=0", "init --ground"), ("--free-root", "init --free-root")):
+        assert cli.main([*given, "--body", "arm8", option, "--overwrite"]) == 2
+        assert there in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

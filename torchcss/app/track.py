@@ -27,6 +27,7 @@ from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
 from torchcss.app.view_files import FrameSelection, OpenView, moments, open_run, open_view
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
+from torchcss.body.root import has_root
 from torchcss.errors import CameraError, ConfigurationError, TrackFileError, check_positive
 from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
@@ -503,7 +504,7 @@ def first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Init
         settings: How it is to be tracked.
 
     Raises:
-        ConfigurationError: If the settings are of another body, or stature.
+        ConfigurationError: If the settings are of another body or stature, or would fit another.
     """
     fitted = read_fitted_body(
         path, camera=camera, dtype=settings.torch_dtype, device=settings.device
@@ -519,6 +520,16 @@ def first_pose_from_file(path: Path, camera: Camera, settings: Settings) -> Init
         raise ConfigurationError(
             f"{path}: the fitted body is {tall:.2f} m tall, the stature is said to be {told:g} m: "
             "leave it out, or give it where the body is fitted (torchcss init --stature)"
+        )
+    if settings.ground is not None:
+        raise ConfigurationError(
+            f"{path}: the fitted body has a size, which the ground would tell: leave it out, or "
+            "give it where the body is fitted (torchcss init --ground)"
+        )
+    if settings.free_root and not has_root(fitted.body):
+        raise ConfigurationError(
+            f"{path}: the fitted body stands in one place: leave free_root out, or give it where "
+            "the body is fitted (torchcss init --free-root)"
         )
     return fitted
 
