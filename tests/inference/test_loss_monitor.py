@@ -15,7 +15,7 @@ from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.loss_monitor import LossMonitor, MonitorState
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
-from torchcss.inference.proposals import CovarianceScaled, HeavyTailed
+from torchcss.inference.proposals import ScaledProposal
 from torchcss.inference.tracker import Tracker
 from torchcss.tracking.presets import PRESETS, make_tracker
 from torchcss.tracking.recovery import Recovery
@@ -169,8 +169,8 @@ def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator:
         assert not wide.soft_matching
         assert wide.dynamics == narrow.dynamics
         before, after = narrow.proposal, wide.proposal
-        if isinstance(before, (CovarianceScaled, HeavyTailed)):
-            assert isinstance(after, (CovarianceScaled, HeavyTailed))
+        if isinstance(before, ScaledProposal):
+            assert isinstance(after, ScaledProposal)
             assert before.covariance_scale is not None
             assert after.covariance_scale == 2 * before.covariance_scale
         else:

@@ -46,10 +46,11 @@ VARIED = {
     "profile_frame": set(),
     "several_views": set(),
     "spectra": {"body"},
-    "track_quadruped": {"body"},
-    "track_robot": {"body", "seed"},
+    "track_quadruped": {"body", "stature"},
+    "track_robot": {"body", "seed", "stature"},
 }
-"""What a script varies itself, or is told by what it tracks."""
+"""What a script varies itself, or is told by what it tracks: a robot's size is that of its file,
+and a stature is refused."""
 
 
 class Caught(Exception):
@@ -127,12 +128,15 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
                 "several_views",
                 "evaluate_posterior",
                 "profile_frame",
-            ):  # whose films are none
+                "long_run",
+            ):  # whose films are none, or whose body has a size that these settings would change
                 tracks = script.posterior if name == "ablation" else script
                 patch.setattr(tracks, "track_video", catch_video)
             if name == "hypothesis_scores":  # which refuses this preset, later
                 patch.setattr(script, "plan_of", catch_plan)
-            words = [*arguments(tmp_path_factory.mktemp(name), name), *options(CHANGED)]
+            refused = {"stature"} & VARIED[name]
+            given = {key: value for key, value in CHANGED.items() if key not in refused}
+            words = [*arguments(tmp_path_factory.mktemp(name), name), *options(given)]
             with pytest.raises(Caught) as caught:
                 script.main(tyro.cli(script.Config, args=words))
             found[name] = caught.value.args[0]

@@ -43,7 +43,12 @@ class Spy:
         self.truth, self.costs = truth, []
 
     def init(self, mixture: GaussianMixture, *, generator: torch.Generator) -> SimpleNamespace:
-        return SimpleNamespace(mixture=mixture)
+        return self._state(mixture)
+
+    def _state(self, mixture: GaussianMixture) -> SimpleNamespace:
+        state = SimpleNamespace(mixture=mixture, frame=len(self.costs))
+        state.per_interval = lambda _: state
+        return state
 
     @property
     def stated_power(self) -> float:
@@ -55,7 +60,7 @@ class Spy:
         self.costs.append(child.cost)
         mean = self.truth[len(self.costs) - 1][None]
         mixture = state.mixture._replace(mean=mean)
-        return SimpleNamespace(mixture=mixture), SimpleNamespace(
+        return self._state(mixture), SimpleNamespace(
             origin=torch.tensor([0]), parent=torch.tensor([0]), prior=prior
         )
 
