@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from torchcss.cost.fused.contour import compare_outline, sum_outline
+from torchcss.cost.fused.contour import sum_outline
 from torchcss.cost.fused.edges import held_gain
-from torchcss.cost.fused.flow import find_interior, follow_flow
+from torchcss.cost.fused.flow import follow_flow
 from torchcss.cost.fused.joints import compare_joints
 from torchcss.cost.fused.kinematics import pose_parts, pose_tree
-from torchcss.cost.fused.outline import find_outline
 from torchcss.cost.fused.projection import project
 from torchcss.cost.fused.records import Array, Nodes, Parts, Result, Tree, View, Workspace
 from torchcss.cost.fused.region import held_contrast
-from torchcss.cost.fused.sight import see_nodes
+from torchcss.cost.fused.view import find_and_compare_outline, find_and_follow_flow
 from torchcss.kernels.compiler import entry, kernel
 
 
@@ -71,22 +70,14 @@ def _differ(one: Array, other: Array) -> bool:
 @kernel
 def _find(parts: Parts, view: View, mode: int, workspace: Workspace) -> int:
     """Find the nodes, what is seen of them, and their matches; how many are in the image."""
-    posed, rays, near, lines = workspace.posed, workspace.rays, workspace.near, workspace.lines
-    count = 0
+    posed, count = workspace.posed, 0
     if view.edges.scale > 0.0 or view.colours.scale > 0.0:
-        nodes = workspace.outline
-        find_outline(view.curves, posed, workspace.facing, nodes)
-        see_nodes(nodes, posed, parts, True, rays, near, lines)
-        see_nodes(nodes, posed, parts, False, rays, near, lines)
-        compare_outline(nodes, view.lens, view.edges, view.colours, False, workspace)
+        find_and_compare_outline(parts, view, False, workspace)
         count = workspace.points.first[len(posed)]
-        _fasten(nodes, posed)
+        _fasten(workspace.outline, posed)
     if view.flow.scale > 0.0:
-        nodes = workspace.interior
-        find_interior(view.flow.nodes, posed, nodes)
-        see_nodes(nodes, posed, parts, False, rays, near, lines)
-        follow_flow(nodes, view.lens, view.flow, mode, False, False, workspace.points)
-        _fasten(nodes, posed)
+        find_and_follow_flow(parts, view, mode, False, workspace)
+        _fasten(workspace.interior, posed)
     return count
 
 

@@ -42,9 +42,9 @@ def add_view(
             _choose_reference(workspace.frames, workspace.reference)
             workspace.sums[:] = 0.0
         if view.edges.scale > 0.0 or view.colours.scale > 0.0:
-            result.value[b] += _outline(parts, view, slopes, workspace)
+            result.value[b] += find_and_compare_outline(parts, view, slopes, workspace)
         if view.flow.scale > 0.0:
-            result.value[b] += _flow(parts, view, mode[b], slopes, workspace)
+            result.value[b] += find_and_follow_flow(parts, view, mode[b], slopes, workspace)
         if view.keypoints.scale > 0.0:
             keypoints = view.keypoints
             result.value[b] += compare_joints(
@@ -71,7 +71,7 @@ def _choose_reference(frames: Array, reference: Array) -> None:
 
 
 @kernel
-def _outline(parts: Parts, view: View, slopes: bool, workspace: Workspace) -> float:
+def find_and_compare_outline(parts: Parts, view: View, slopes: bool, workspace: Workspace) -> float:
     """Cost of the contour nodes, their derivatives added to the sums."""
     nodes = workspace.outline
     find_outline(view.curves, workspace.posed, workspace.facing, nodes)
@@ -84,7 +84,9 @@ def _outline(parts: Parts, view: View, slopes: bool, workspace: Workspace) -> fl
 
 
 @kernel
-def _flow(parts: Parts, view: View, mode: int, slopes: bool, workspace: Workspace) -> float:
+def find_and_follow_flow(
+    parts: Parts, view: View, mode: int, slopes: bool, workspace: Workspace
+) -> float:
     """Cost of the nodes all over the surface, their derivatives added to the sums."""
     nodes = workspace.interior
     find_interior(view.flow.nodes, workspace.posed, nodes)
