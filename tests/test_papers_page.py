@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from torchcss.tracking.presets import PRESETS
+from torchcss.tracking.settings import Settings
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = ("from_the_papers_to_the_code.md", "mathematics.md", "decisions.md")
@@ -97,6 +98,13 @@ def test_every_test_preset_and_decision_of_the_page_is_there() -> None:
     presets = set(re.findall(r"`((?:ijrr|rr|heap|condensation)_\w+)`", PAPERS))
     assert presets <= set(PRESETS)
     assert {name for name in PRESETS if name.startswith("rr_")} <= presets
+
+
+def test_the_page_says_which_of_the_papers_trackers_keep_parts_apart() -> None:
+    (used,) = re.findall(r"^\| 3\.2\.4 \|.*\|.*\|(.*)\|.*\|$", PAPERS, flags=re.MULTILINE)
+    papers = {name for name in PRESETS if name.startswith(("ijrr_", "rr_"))}
+    repel = {name for name in papers if "interpenetration" in Settings(preset=name).used_terms}
+    assert set(re.findall(r"`(\w+)`", used)) == repel
 
 
 def test_every_step_of_both_algorithms_has_a_line() -> None:

@@ -512,6 +512,9 @@ def test_the_papers_stages_are_one_fit_that_keeps_parts_apart():
     stabiliser = choice.find(Stabiliser)
     assert stabiliser is not None
     assert stabiliser.hidden_only
+    # [RR] repels no parts.
+    report = InitialiseOptions(sigma=2.0, printed="rr").joint_choice
+    assert report == choice.without("interpenetration")
 
 
 def test_a_coarse_pose_leads_a_single_start_to_the_fit(found: Initialisation):
@@ -519,10 +522,10 @@ def test_a_coarse_pose_leads_a_single_start_to_the_fit(found: Initialisation):
     names = found.free_body.state_names
     coarse = dict(zip(names, found.free_mixture.mean[0].tolist(), strict=True))
     coarse = {name: value for name, value in coarse.items() if not name.endswith("_length")}
-    near = find(someone, replace(PAPERS, coarse_pose=coarse), num_modes=1, printed=True)
+    near = find(someone, replace(PAPERS, coarse_pose=coarse), num_modes=1, printed="ijrr")
     assert len(near.cost) == 1
     assert abs(error_mm(near, someone)[0] - error_mm(found, someone)[0]) < 5
-    at_rest = find(someone, PAPERS, num_modes=1, printed=True)
+    at_rest = find(someone, PAPERS, num_modes=1, printed="ijrr")
     assert error_mm(at_rest, someone)[0] > error_mm(near, someone)[0] + 20
     with pytest.raises(BodyError, match="tail"):
         find(someone, replace(PAPERS, coarse_pose={"tail": 0.0}))

@@ -103,6 +103,17 @@ def test_the_page_says_which_tracker_it_was(folder: Path) -> None:
     assert facts_of(folder, {})["Preset"] == "not known"
 
 
+def test_the_page_says_how_descents_ended(folder: Path) -> None:
+    ended = {"running": 0, "converged": 3, "small_step": 90, "step_limit": 7, "non_finite": 0}
+    told = facts_of(folder, {"optimiser_status": ended, "covariances_floored": 2})["Descents"]
+    assert told == (
+        "3 converged, 90 ended where no short step led lower, 7 stopped at the step limit, "
+        "2 covariances had a least curvature put in"
+    )
+    filtered = {**dict.fromkeys(ended, 0), "non_finite": 4}
+    assert "Descents" not in facts_of(folder, {"optimiser_status": filtered})
+
+
 def test_the_page_says_what_told_the_size(folder: Path) -> None:
     run = Run.open(folder)
     track = run.track._replace(joint_names=("l_knee",), size_deviation=0.02)

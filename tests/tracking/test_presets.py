@@ -194,6 +194,8 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
         assert optimiser.max_steps >= 100
         assert (optimiser.tolerance, optimiser.initial_radius) == (1e-6, 1.0)
     if isinstance(tracker, Tracker):
+        # Of one mode alone the descent starts at the mode; the others draw all their samples.
+        assert tracker.proposal.include_modes == (tracker.num_samples == 1)
         assert tracker.converged_only
         assert not tracker.capped
         assert (tracker.coarse_every, tracker.survivors, tracker.soft_matching) == (0, 0, False)
@@ -309,6 +311,7 @@ def test_either_potential_of_the_papers_can_be_chosen():
     assert contour.fitted_level < hidden < contour.unmatched < 0.5
     gaussian = make_choice(Settings(preset="ijrr_gaussian_single", potential="leclerc"), 2.0)
     assert gaussian == make_choice(Settings(preset="ijrr_gaussian_single"), 2.0)
+    assert not Settings(preset="ijrr_gaussian_single", potential="leclerc").changed()
     with pytest.raises(ConfigurationError, match="potential must be one of lorentzian, leclerc"):
         Settings(preset="ijrr_css", potential="huber")  # type: ignore[arg-type]
 

@@ -26,7 +26,7 @@ from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError, VideoError
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.tracker import Tracker, TrackerState
+from torchcss.inference.tracker import Particles, Tracker, TrackerState
 from torchcss.initialise.result import Initialisation
 from torchcss.initialise.view import CameraView
 from torchcss.io import tracks
@@ -326,7 +326,12 @@ def test_base_follows_a_body_that_leans_over(generator: torch.Generator):
     )
     step = 0.05 * torch.randn(3, 30, generator=generator, dtype=torch.float64)
     state = TrackerState(mixture, step, generator.get_state(), torch.zeros((), dtype=torch.long))
+    # What a filter weighs, and where the descents of Fig. 4 [RR] begin.
+    state = state._replace(particles=Particles(x, step, torch.zeros(3), torch.arange(3)))
     moved, after = follow_with_base(body, state)
+    assert after.particles is not None
+    assert torch.equal(after.particles.x, after.mixture.mean)
+    assert torch.equal(after.particles.velocity, after.velocity)
     angles = after.mixture.mean[0, [moved.state_index(f"root_{a}") for a in ("yaw", "pitch")]]
     torch.testing.assert_close(angles, torch.zeros(2, dtype=torch.float64), atol=1e-9, rtol=0)
     torch.testing.assert_close(moved.pose(after.mixture.mean).joints, body.pose(x).joints)

@@ -40,6 +40,7 @@ from torchcss.io.tracks import write_summary
 from torchcss.io.video import read_frame
 from torchcss.joint_names import names_in
 from torchcss.show.overlay import draw_poses
+from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.settings import Settings, check_seed
 from torchcss.types import Keypoints, frozen
 from torchcss.vision.camera import Camera
@@ -198,7 +199,8 @@ def initialise_video(
         video: A video, or a folder of images.
         keypoints: Its keypoints in every frame.
         camera: Its camera.
-        settings: Body, terms, working size, type and device.
+        settings: Body, terms, working size, type and device. A paper's preset has the paper's
+            priors (`InitialiseOptions.printed`).
         start: The frame.
         noise: Noise of the keypoints.
         generator: Source of the starting poses.
@@ -207,6 +209,7 @@ def initialise_video(
     Raises:
         TorchcssError: If the frame cannot be read, or too few joints are known in it.
     """
+    paper = PRESETS[settings.preset].cost
     options = InitialiseOptions(
         sigma=noise.sigma,
         stature=settings.stature,
@@ -214,6 +217,7 @@ def initialise_video(
         learn_noise=noise.is_guess,
         least_joints=LEAST_JOINTS,
         pose_prior="pose_prior" in settings.used_terms,
+        printed=None if paper == "ours" else paper,
         contours="contour" in settings.used_terms,
         colours="region" in settings.used_terms,
         working_size=settings.working_size,

@@ -45,9 +45,9 @@ class InitialiseOptions:
         least_joints: Fewest joints of the body that have to be known; with fewer than
             `LEAST_JOINTS` much stays at its prior.
         pose_prior: Prefer poses that people take (`torchcss.cost.pose_prior`).
-        printed: Take the papers' priors: no pose prior, stabilisers on what is hard to estimate
-            alone, and repulsion in all stages. While the second and third stage fit the shape,
-            repulsion sees the parts as they were before; afterwards as they were found.
+        printed: Take a paper's priors: no pose prior, stabilisers on what is hard to estimate
+            alone, and in [IJRR] repulsion in all stages. While the second and third stage fit the
+            shape, repulsion sees the parts as they were before; afterwards as they were found.
         contours: Run the second and third stage on the picture's contours.
         colours: Let them see the colours on either side too.
         bends: Let the third stage bend the parts, too.
@@ -69,7 +69,7 @@ class InitialiseOptions:
     num_modes: int | None = 8
     least_joints: int = 1
     pose_prior: bool = True
-    printed: bool = False
+    printed: Literal["ijrr", "rr"] | None = None
     contours: bool = True
     colours: bool = True
     bends: bool = False
@@ -98,7 +98,7 @@ class InitialiseOptions:
         repulsion.
         """
         search = replace(PAPERS, coarse_pose=self.search.coarse_pose)
-        return replace(self, search=search, num_modes=1, printed=True, colours=False, bends=True)
+        return replace(self, search=search, num_modes=1, printed="ijrr", colours=False, bends=True)
 
     @property
     def evaluator(self) -> Engine | None:
@@ -113,10 +113,10 @@ class InitialiseOptions:
         return CostChoice(
             terms=(
                 JointTerm(sigma=self.sigma, potential_kind=self.potential_kind),
-                Stabiliser(hidden_only=self.printed),
+                Stabiliser(hidden_only=self.printed is not None),
                 Anthropometric(stature=0.0) if known else Anthropometric(),
                 *((PosePrior(),) if self.pose_prior and not self.printed else ()),
-                *((Interpenetration(),) if self.printed else ()),
+                *((Interpenetration(),) if self.printed == "ijrr" else ()),
             ),
             weights=self.weights,
         )

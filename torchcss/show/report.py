@@ -34,6 +34,7 @@ from torchcss.show.track_plots import (
     side_view_figure,
 )
 from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset
+from torchcss.types import Status
 
 REPORT_NAME = "report.html"
 
@@ -204,6 +205,8 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("Keypoints", _keypoints(run)),
         ("Preset", _preset(run)),
     ]
+    if descents := _descents(run):
+        facts.append(("Descents", descents))
     if "l_knee" in track.joint_names:
         stature, ground = settings.get("stature"), settings.get("ground")
         told = f"{stature:g} m, as given" if stature else "not given; the size is known otherwise"
@@ -239,6 +242,26 @@ def _preset(run: Run) -> str:
     if changed := summary.get("changed_beside_preset"):
         parts.append("changed beside it: " + ", ".join(map(str, changed)))
     return "; ".join(parts)
+
+
+_ENDS = {
+    Status.CONVERGED: "converged",
+    Status.SMALL_STEP: "ended where no short step led lower",
+    Status.STEP_LIMIT: "stopped at the step limit",
+    Status.NON_FINITE: "had no finite cost",
+}
+
+
+def _descents(run: Run) -> str:
+    """How descents ended, and how many covariances needed a floor; of filters nothing."""
+    ended = run.summary.get("optimiser_status", {})
+    counts = {words: ended.get(status.name.lower(), 0) for status, words in _ENDS.items()}
+    parts = [f"{count} {words}" for words, count in counts.items() if count]
+    if not any(list(counts.values())[:-1]):
+        return ""
+    if floored := run.summary.get("covariances_floored"):
+        parts.append(f"{floored} covariances had a least curvature put in")
+    return ", ".join(parts)
 
 
 def _keypoints(run: Run) -> str:

@@ -9,6 +9,7 @@ memory, and a run can end as soon as it has lost the body.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +60,8 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
 
     Args:
         sequence: What is to be tracked.
-        settings: The body, the seed, the type; the tracker does not matter.
+        settings: The body, the seed, the type. The tracker does not matter, nor do its terms: all
+            start from the same pose, which those of the default preset find.
         start: First frame.
     """
     keypoints, dtype, device = sequence.keypoints, settings.torch_dtype, settings.device
@@ -77,8 +79,9 @@ def find_start(sequence: RecordedSequence, settings: Settings, *, start: int = 0
         )
     else:
         sigma = typical_sigma(keypoints)
+        neutral = replace(settings, preset=Settings.preset, terms=None)
         first = initialise_video(
-            sequence.video, keypoints, camera, settings, start=start, noise=Noise(sigma),
+            sequence.video, keypoints, camera, neutral, start=start, noise=Noise(sigma),
             generator=generator,
         )  # fmt: skip
     return Start(first, sigma, generator)

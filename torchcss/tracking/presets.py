@@ -30,7 +30,8 @@ sample that descends to the end.
 
 The papers' rows (decision "papers' presets") have the papers' terms (`Preset.terms`), no recovery,
 no flips, no descents on a coarser cost, driftless diffusion where that is printed, keypoints in the
-first frame alone, and they start from the covariance of one fit (section 5 of both). Cham and
+first frame alone, and they start from the covariance of one fit, which has the papers' priors
+(section 5 of both). Where several modes are kept nothing but what was drawn descends. Cham and
 Rehg's "ssd" row has Gaussian errors, Gauss-Newton Hessians, no joint limits and no repulsion;
 [IJRR] names only the metric and the optimiser, the rest is our reading.
 """
@@ -85,8 +86,8 @@ class Preset:
         power_arm: `likelihood_power` for an arm, if other than for a body. Its modes cost the same
             for longer, since it has no `segmentation`: the rest of its person looks the same.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
-            constant velocity. The papers' trackers have 0. With some, a mode does not lag behind a
-            limb whose flow is underestimated.
+            constant velocity. The papers' own trackers have 0, Cham and Rehg's 1. With some, a mode
+            does not lag behind a limb whose flow is underestimated.
         noise: Dynamical noise that the tracker searches by, in multiples of the motion of one
             frame. Ours that descend from scaled covariances have 1, realistic noise; the papers' 0.
         robust: Whether the cost's potentials are robust (False: `Quadratic`).
@@ -251,7 +252,7 @@ _HEAP_HOGG = Preset(
 _CHAM_REHG = replace(
     _printed(_HEAP_HOGG),
     what="Cham and Rehg's multiple-hypothesis tracker in 3D, robust ([IJRR] section 6.1)",
-    proposal=ChamRehg(deviation=0.0, piecewise=False),
+    proposal=ChamRehg(deviation=0.0, piecewise=False, include_modes=False),
     persistence=1.0,
 )
 _CONDENSATION = Preset(

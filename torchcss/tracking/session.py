@@ -63,7 +63,7 @@ from torchcss.tracking.view import (
     ViewMemory,
     ViewObservation,
 )
-from torchcss.types import TIME_ROUNDING, Bounds, Frame
+from torchcss.types import TIME_ROUNDING, Bounds, Frame, Vectors
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
 
@@ -561,7 +561,7 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
 
     Args:
         body: The body on its base.
-        state: The tracker's state on that base.
+        state: The tracker's state on that base; particles and hypotheses move along.
     """
     if not has_root(body):
         return body, state
@@ -570,15 +570,24 @@ def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, T
     if float(angles[1].abs()) < _PITCH_LIMIT and float(angles.abs().max()) < math.radians(270):
         return body, state
     mixture, base = state.mixture, root_pose(body, best)
-    _, last, _ = move_base(body, *base, mixture.mean - state.velocity)
+    turned = body.state_columns(ROOT_NAMES[3:])
+
+    def moved(x: Vectors, velocity: Vectors) -> tuple[Vectors, Vectors]:
+        """States and their motions on the new base."""
+        now, last = (move_base(body, *base, states)[1] for states in (x, x - velocity))
+        step = now - last
+        step[:, turned] = within_half_turn(step[:, turned])
+        return now, step
+
+    particles = state.particles
+    if particles is not None:
+        x, step = moved(particles.x, particles.velocity)
+        particles = particles._replace(x=x, velocity=step)
+    _, velocity = moved(mixture.mean, state.velocity)
     body, mean, covariance = move_base(body, *base, mixture.mean, mixture.covariance)
     assert covariance is not None
-    velocity = mean - last
-    turned = body.state_columns(ROOT_NAMES[3:])
-    velocity[:, turned] = within_half_turn(velocity[:, turned])
-    # Particles belong to the old base; a filter draws new ones from the mixture.
     return body, state._replace(
         mixture=mixture._replace(mean=mean, covariance=covariance),
         velocity=velocity,
-        particles=None,
+        particles=particles,
     )

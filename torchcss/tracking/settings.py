@@ -262,6 +262,7 @@ class Settings:
             **{
                 name: self._is_given(name) for name in ("samples", "modes", *_OF_SAMPLES, *_OF_COST)
             },
+            "potential": row.robust and self._is_given("potential"),
             "keypoints_use": self.keypoints_first_only != (row.keypoints_use == "first"),
             "terms": set(self.used_terms) != set(_preset_terms(row)),
             "curvature": self.curvature not in (None, row.curvature.value),
