@@ -165,7 +165,8 @@ CASE: Final = r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"
 """Where a word begins by its case."""
 
 _SIDES: Final[dict[str, str]] = {
-    "left": "l_", "right": "r_", "l": "l_", "r": "r_", "lt": "l_", "rt": "r_"
+    "left": "l_", "right": "r_", "l": "l_", "r": "r_", "lt": "l_", "rt": "r_", "lft": "l_",
+    "rgt": "r_",
 }  # fmt: skip
 
 
@@ -203,11 +204,11 @@ def canonical_joint_name(name: str) -> str | None:
 
 
 def _unglued(word: str, known: Container[str]) -> tuple[str, str]:
-    """Side and place of a word that may begin with the side: lshoulder, leftshoulder."""
-    for prefix, side in _SIDES.items():
-        place = word.removeprefix(prefix)
-        if place != word and place in known:
-            return side, place
+    """Side and place of a word that may begin or end with the side: lshoulder, shoulderleft."""
+    for spelt, side in _SIDES.items():
+        for place in (word.removeprefix(spelt), word.removesuffix(spelt)):
+            if place != word and place in known:
+                return side, place
     return "", word
 
 
@@ -277,8 +278,8 @@ _SEGMENTS: Final = frozenset(
 ) - {"hand"}
 """Words of a limb's parts; files that use them call no joint after itself."""
 
-_ACCLAIM: Final = _of_limbs("femur", "tibia", "foot", "humerus", "radius", "hand")
-"""Acclaim's bones by their starts, as in models for MuJoCo."""
+_ACCLAIM: Final = _of_limbs("femur", "tibia", "foot talus", "humerus", "radius", "hand")
+"""Acclaim's bones by their starts, as in models for MuJoCo, and OpenSim's."""
 
 _ENDS: Final = _of_limbs("hipjoint", "femur", "tibia", "clavicle", "humerus", "wrist")
 """The same where joints are the ends of Acclaim's bones. `radius` and `wrist` together are the

@@ -257,6 +257,36 @@ def test_a_csv_and_folders(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "video;sigma;stop\n a.mp4;2,5;20\nb.mp4;;\n;;\n"),  # of a spreadsheet
+        ("a.csv", "sep=,\r\nVideo, Sigma, Stop,\r\na.mp4, 2.5, 20,\r\nb.mp4\r\n"),
+        ("a.csv", "\nvideo,sigma,stop\na.mp4,2.5,20.0\nb.mp4,,\n"),  # pandas: some have none
+        ("a.tsv", "video\tsigma\tstop\na.mp4\t2.5\t20\nb.mp4\t\t\n"),
+        ("a.json", '[{"video": "a.mp4", "sigma": 2.5,\n "stop": 20.0},\n{"video": "b.mp4"}]'),
+        ("a.jsonl", '\ufeff{"video": "a.mp4", "sigma": 2.5, "stop": 20}\r\n{"video": "b.mp4"}\r\n'),
+    ],
+)
+def test_manifests_as_programs_write_them(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text, "utf-8", newline="")
+    one, other = read_manifest(tmp_path / name)
+    assert (one.name, one.row["sigma"], one.row["stop"]) == ("a", 2.5, 20)
+    assert one.row["video"] == str(tmp_path / "a.mp4")
+    assert (other.name, {*other.row}) == ("b", {"video"})
+
+
+def test_a_folder_tells_what_it_leaves_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder in ("pictures", "walk"):
+        (tmp_path / folder).mkdir()
+    for name in ("a.MTS", "._a.MTS", "notes.txt", "walk/video.mov"):
+        (tmp_path / name).touch()
+    assert [clip.name for clip in read_manifest(tmp_path)] == ["a", "walk"]
+    assert "left out: pictures\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "empty"),
@@ -270,6 +300,7 @@ def test_a_csv_and_folders(tmp_path: Path) -> None:
         ('{"video": "v", "focal": "long"}', "focal: expected a number"),
         ('{"video": ["v"]}', "video: expected a text"),
         ('{"video": true}', "video: expected a text"),
+        ('{"video": "v", "normalised": "yes"}', "normalised: expected pixels or zero-one"),
         ('{"video": "v"}\n\n{"camera": "c"}', "line 3: expected a column video"),
         ("[" * 100_000, "line 1: no JSON"),
         *(

@@ -228,9 +228,11 @@ def test_start_beyond_the_end_of_a_container_that_does_not_count(tmp_path: Path)
 # Rotation.
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
-def test_rotation_metadata_is_applied(tmp_path: Path, quarter_turns: int) -> None:
-    # A bright corner, top left as coded; the display matrix of the track header turns it.
+def test_rotation_metadata_is_applied(tmp_path: Path, quarter_turns: int, mirrored: bool) -> None:
+    # A bright corner, top left as coded; the display matrix of the track header turns it, after it
+    # has exchanged left and right, as some programs do with the front camera.
     path = tmp_path / "a.mp4"
     image = np.zeros((32, 64, 3), np.uint8)
     image[:16, :16] = 255
@@ -242,12 +244,13 @@ def test_rotation_metadata_is_applied(tmp_path: Path, quarter_turns: int) -> Non
     matrix = header + 40  # version 0: after the times, identity, layer, group and volume
     cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter_turns]  # clockwise
     one = 1 << 16
+    side = -one if mirrored else one
     data[matrix : matrix + 36] = struct.pack(
-        ">9i", cosine * one, sine * one, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30
+        ">9i", cosine * side, sine * side, 0, -sine * one, cosine * one, 0, 0, 0, 1 << 30
     )
     path.write_bytes(bytes(data))
     reader = VideoReader(path)
-    expected = np.rot90(image, -quarter_turns)
+    expected = np.rot90(image[:, ::-1] if mirrored else image, -quarter_turns)
     assert (reader.info.height, reader.info.width) == expected.shape[:2]
     for frame in reader:
         assert frame.image.flags["C_CONTIGUOUS"]
@@ -660,8 +663,21 @@ def test_one_image_is_a_video_of_one_frame(tmp_path: Path) -> None:
     assert [frame.image.shape for frame in VideoReader(tmp_path / "a.png")] == [(5, 7, 3)]
 
 
+@pytest.mark.parametrize("name", ["a.tif", "a.webp", "a.png"])
+def test_a_file_of_many_pictures_is_no_picture(tmp_path: Path, name: str) -> None:
+    first, *more = (Image.new("RGB", (7, 5), (40 * level, 0, 0)) for level in range(4))
+    first.save(tmp_path / name, save_all=True, append_images=more)
+    with pytest.raises(VideoError, match="4 pictures in one file; save them as a folder"):
+        VideoReader(tmp_path / name)
+    first.save(tmp_path / "a.tif", save_all=True, append_images=[Image.new("RGB", (3, 2))])
+    assert VideoReader(tmp_path / "a.tif").info.num_frames == 1  # beside it is a small copy
+
+
 def test_bad_folders(tmp_path: Path) -> None:
     with pytest.raises(VideoError, match="no images"):
+        VideoReader(tmp_path)
+    (tmp_path / "b.MOV").touch()
+    with pytest.raises(VideoError, match=r"give a video in it, such as .*b\.MOV"):
         VideoReader(tmp_path)
     Image.new("RGB", (8, 6)).save(tmp_path / "0.png")
     Image.new("RGB", (9, 6)).save(tmp_path / "1.png")

@@ -106,6 +106,14 @@ def test_a_sliding_joint_is_in_metres(tmp_path: Path) -> None:
     assert panel(angles_figure(track), "joint2 (degrees)")
 
 
+def test_names_of_strangers_are_no_formulas(tmp_path: Path) -> None:
+    path = write_arm(tmp_path / "arm.urdf", (((0, 0, 0.3), (0, 0, 0), (0, 0, 1), 0.4),) * 2)
+    path.write_text(path.read_text().replace("joint1", r"$\\frac{$").replace("link1", r"$x^{$"))
+    track = make_track(load_body(path))
+    for figure in (angles_figure(track), joints_figure(track), spectra_figure(track)):
+        save_figure(figure, tmp_path / "a.png")
+
+
 def test_lines_of_the_root_end_where_the_base_moves() -> None:
     track = make_track(load_body("body34"), (1, 1, 1, 1))  # the base moves in every frame
     figure = angles_figure(track)

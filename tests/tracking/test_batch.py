@@ -198,6 +198,9 @@ def test_a_session_is_tracked_once_at_a_time(films: list[SyntheticSequence]) -> 
     session = session_of(films[0], 0)
     with pytest.raises(ConfigurationError, match="one is given twice"):
         next(torchcss.track_batch([(session, films[0].frames)] * 2))
+    frames = iter(films[0].frames)  # of which each would get every second one
+    with pytest.raises(ConfigurationError, match="one is given twice"):
+        next(torchcss.track_batch((session_of(films[0], n), frames) for n in range(2)))
 
 
 def test_no_sequence_at_all() -> None:

@@ -43,7 +43,7 @@ from dataclasses import asdict
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 from urllib.parse import quote
 
 import tyro
@@ -62,8 +62,9 @@ from torchcss.files import (
     write_text,
 )
 from torchcss.io.checkpoint import CHECKPOINT_NAME, read_checkpoint
+from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import TRACK_NAME
-from torchcss.io.video import VideoReader
+from torchcss.io.video import VIDEO_SUFFIXES, VideoReader
 from torchcss.joint_names import names_in
 from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings, settings_from_plain
@@ -72,17 +73,26 @@ from torchcss.types import frozen
 FILE_COLUMNS = names_in("video camera keypoints masks init")
 """Columns that are paths, from the manifest's folder on."""
 
-OPTION_COLUMNS = names_in("camera_name layout person frame_rate sigma focal fov stride")
+OPTION_COLUMNS = names_in("camera_name layout normalised person frame_rate sigma focal fov stride")
 """Columns that are options of the files, see `TrackOptions`."""
 
-SETTING_COLUMNS = names_in("body preset seed samples modes keypoints_use working_size")
+SETTING_COLUMNS = names_in(
+    "body stature ground preset seed samples modes keypoints_use working_size"
+)
 """Columns that are settings of this clip alone."""
 
+
+def _whole(text: str) -> int:
+    """A whole number; in a column with empty cells many programs write 5 as 5.0."""
+    return int(re.sub(r"\.0*$", "", text))
+
+
 _NUMBERS = {
-    **dict.fromkeys(names_in("start stop stride seed samples modes working_size"), int),
-    **dict.fromkeys(names_in("frame_rate sigma focal fov"), float),
+    **dict.fromkeys(names_in("start stop stride seed samples modes working_size"), _whole),
+    **dict.fromkeys(names_in("frame_rate sigma focal fov stature ground"), float),
 }
 _COLUMNS = ("name", "start", "stop", *FILE_COLUMNS, *OPTION_COLUMNS, *SETTING_COLUMNS)
+_SCALES = " or ".join(get_args(Scale))
 _FOLDER = re.compile(r"(?!\.|batch\.(json|html)$)[^\0-\x1f\ud800-\udfff]+")
 """Names of clips: not hidden, not the batch's own files, and of signs that can be written."""
 
@@ -97,7 +107,7 @@ class Batch:
     """Track many clips; the same command goes on with what was interrupted."""
 
     manifest: Annotated[Path, tyro.conf.Positional]
-    """CSV or JSON lines with the columns video, camera, keypoints, name and options; or a folder of
+    """CSV or JSON with the columns video, camera, keypoints, name and options; or a folder of
     folders that hold video.mp4, cameras.json and keypoints2d.npz, or of videos."""
     out: Path = Path("out/batch")
     """Folder of the results, one folder a clip."""
@@ -209,27 +219,18 @@ class Clip(NamedTuple):
 
 
 def read_manifest(path: Path) -> list[Clip]:
-    """The clips of a CSV, of JSON lines, or of a folder.
+    """The clips of a table, of JSON (a list, or an object a line), or of a folder.
 
     Raises:
         ConfigurationError: If it is none, a column is unknown or there twice, or two clips have one
             name.
     """
-    rows: dict[str, Any] = {}
     if path.is_dir():
-        rows = {row["video"]: row for row in _rows_of_folder(path)}
-    elif path.suffix.lower() == ".csv":
-        text = read_text(path, ConfigurationError)
-        with refusing(ConfigurationError, f"{path}: not a table"):
-            table = csv.DictReader(io.StringIO(text, newline=""))
-            rows = {f"{path}: row {number}": row for number, row in enumerate(table, 1)}
-        columns = table.fieldnames or ()
-        if twice := [name for name in columns if columns.count(name) > 1]:
-            raise ConfigurationError(f"{path}: two columns are called {twice[0]}; expected one")
+        rows: Mapping[str, Any] = {row["video"]: row for row in _rows_of_folder(path)}
     else:
-        for number, line in enumerate(read_text(path, ConfigurationError).split("\n"), 1):
-            with refusing(ConfigurationError, f"{path}: line {number}: no JSON"):
-                rows |= {f"{path}: line {number}": json.loads(line)} if line.strip() else {}
+        text = read_text(path, ConfigurationError)
+        read_rows = _rows_of_json if text.lstrip()[:1] in ("[", "{") else _rows_of_table
+        rows = read_rows(path, text)
     folder = path if path.is_dir() else path.parent
     clips = [_clip(row, where, folder) for where, row in rows.items()]
     if not clips:
@@ -240,14 +241,63 @@ def read_manifest(path: Path) -> list[Clip]:
     return clips
 
 
+def _rows_of_table(path: Path, text: str) -> dict[str, dict[str | None, Any]]:
+    """The rows that hold anything, whatever separates their cells."""
+    text = re.sub(r"^\s*(sep=.\r?\n)?", "", text)  # for Excel
+    comma = max(",;\t", key=text.partition("\n")[0].count)
+    rows: dict[str, dict[str | None, Any]] = {}
+    with refusing(ConfigurationError, f"{path}: not a table"):
+        source = io.StringIO(text, newline="")
+        table = csv.DictReader(source, delimiter=comma, skipinitialspace=True)
+        table.fieldnames = columns = [name.strip().lower() for name in table.fieldnames or ()]
+        for number, row in enumerate(table, 1):
+            # Spreadsheets go on with empty columns and rows.
+            cells = {
+                n: _stripped(n, cell, comma) for n, cell in row.items() if n or any(cell or ())
+            }
+            if any(cells.values()):
+                rows[f"{path}: row {number}"] = cells
+    if twice := [name for name in columns if name and columns.count(name) > 1]:
+        raise ConfigurationError(f"{path}: two columns are called {twice[0]}; expected one")
+    return rows
+
+
+def _stripped(column: str | None, cell: Any, comma: str) -> Any:
+    """A cell without blanks around it; whoever separates cells otherwise may write 2,5."""
+    if not isinstance(cell, str):  # there is none, or there are several
+        return cell
+    return cell.strip().replace(",", "." if column in _NUMBERS and comma != "," else ",")
+
+
+def _rows_of_json(path: Path, text: str) -> dict[str, Any]:
+    """The entries of a list, or the objects of all lines."""
+    with suppress(ValueError, RecursionError):
+        if isinstance(entries := json.loads(text), list):
+            return {f"{path}: entry {number}": row for number, row in enumerate(entries, 1)}
+    rows: dict[str, Any] = {}
+    for number, line in enumerate(text.split("\n"), 1):
+        with refusing(ConfigurationError, f"{path}: line {number}: no JSON"):
+            rows |= {f"{path}: line {number}": json.loads(line)} if line.strip() else {}
+    return rows
+
+
 def _rows_of_folder(folder: Path) -> Iterator[dict[str, str]]:
+    """Videos, and folders of a video with its files; of other folders a line is printed."""
     usual = {"camera": "cameras.json", "keypoints": "keypoints2d.npz"}
-    for inner in sorted(folder.iterdir()):
-        if inner.is_dir() and (inner / "video.mp4").is_file():
+    others: list[str] = []
+    # What begins with a dot is the system's.
+    for inner in sorted(each for each in folder.iterdir() if not each.name.startswith(".")):
+        if inner.is_dir():
+            videos = [each for s in VIDEO_SUFFIXES if (each := inner / f"video{s}").is_file()]
             beside = {c: str(inner / n) for c, n in usual.items() if (inner / n).is_file()}
-            yield {"name": inner.name, "video": str(inner / "video.mp4"), **beside}
-        elif inner.suffix.lower() in (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"):
+            if videos:
+                yield {"name": inner.name, "video": str(videos[0]), **beside}
+            else:
+                others.append(inner.name)
+        elif inner.suffix.lower() in VIDEO_SUFFIXES:
             yield {"video": str(inner)}
+    if others and os.environ.get("RANK", "0") == "0":
+        print(f"{folder}: without a video.mp4, left out: {', '.join(others)}", file=sys.stderr)
 
 
 def _clip(row: object, where: str, folder: Path) -> Clip:
@@ -261,15 +311,17 @@ def _clip(row: object, where: str, folder: Path) -> Clip:
         )
     given: dict[str, Any] = {}
     for name, value in row.items():
-        if value in (None, ""):
+        if value in (None, "") or value != value:  # NaN is how pandas writes an empty cell
             continue
         kind = _NUMBERS.get(name, str)
         with suppress(ValueError):
             if isinstance(value, str | int | float) and not isinstance(value, bool):
                 given[name] = kind(str(value))
         if name not in given:
-            what = {int: "a whole number", float: "a number", str: "a text"}[kind]
+            what = {_whole: "a whole number", float: "a number", str: "a text"}[kind]
             raise unexpected(ConfigurationError, f"{where}: {name}", what, value)
+        if name == "normalised" and given[name] not in get_args(Scale):
+            raise unexpected(ConfigurationError, f"{where}: {name}", _SCALES, value)
         if name in FILE_COLUMNS:
             given[name] = os.path.abspath(folder / given[name])
     name = given.pop("name", Path(given["video"]).stem)

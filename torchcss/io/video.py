@@ -3,8 +3,8 @@
 A video is a sequence of `Frame(index, time_s, image)`; `index` counts from the first frame of the
 file, whatever `start`, `stop` and `stride` select: keypoints and references keep their place.
 Frames are found by decoding from the beginning, never by seeking: seeking is exact in few
-containers only. Rotation that a telephone writes into the file is applied, as every player does,
-and high dynamic range is brought to 8 bit (`torchcss.io.high_dynamic_range`).
+containers only. Pictures are turned and mirrored as a telephone writes into the file, as players
+do, and high dynamic range is brought to 8 bit (`torchcss.io.high_dynamic_range`).
 
 A damaged video is read up to the damage. The frames before it are yielded, then a `VideoError` says
 how many there were; whoever consumed them keeps what was computed. An MPEG-TS does not say how long
@@ -46,6 +46,9 @@ if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or wr
 
 IMAGE_SUFFIXES = names_in(".jpg .jpeg .png .bmp .tif .tiff .webp .pgm .ppm")
 """What counts as a frame in a folder of images."""
+
+VIDEO_SUFFIXES = names_in(".mp4 .mov .avi .mkv .webm .m4v .mpg .mpeg .wmv .mts .m2ts .3gp")
+"""What counts as a video in a folder of clips; others are read too."""
 
 # Demuxers that make pictures out of text or of anything at all: no video comes in them. Below,
 # those of playlists, which name other files.
@@ -355,18 +358,16 @@ class VideoReader:
     def _find_images(self) -> list[Path] | None:
         try:
             if self.path.is_dir():
-                images = [
-                    entry
-                    for entry in self.path.iterdir()
-                    # A folder or a broken link of such a name is an image missing: reading it says
-                    # so, where leaving it out would shift all frames after it.
-                    if entry.suffix.lower() in IMAGE_SUFFIXES and not entry.name.startswith(".")
-                ]
+                entries = [each for each in self.path.iterdir() if not each.name.startswith(".")]
+                # A folder or a broken link of such a name is an image missing: reading it says so,
+                # where leaving it out would shift all frames after it.
+                images = [each for each in entries if each.suffix.lower() in IMAGE_SUFFIXES]
+                films = [each for each in entries if each.suffix.lower() in VIDEO_SUFFIXES]
                 if not images:
-                    suffixes = ", ".join(IMAGE_SUFFIXES)
-                    raise VideoError(
-                        f"no images in this folder; expected files that end in {suffixes}"
-                    )
+                    expected = f"expected files that end in {', '.join(IMAGE_SUFFIXES)}"
+                    if films:
+                        expected = f"give a video in it, such as {min(films)}"
+                    raise VideoError(f"no images in this folder; {expected}")
                 return sorted(images, key=lambda entry: natural_order(entry.name))
             if not self.path.exists():
                 raise VideoError("there is no such file or folder; check the path of the video")
@@ -378,7 +379,13 @@ class VideoReader:
             raise
         except (OSError, ValueError) as error:  # ValueError: a null character in the name
             raise VideoError(f"{str(self.path)!r}: cannot be read: {_reason(error)}") from error
-        return [self.path] if self.path.suffix.lower() in IMAGE_SUFFIXES else None
+        if self.path.suffix.lower() not in IMAGE_SUFFIXES:
+            return None
+        if (count := _num_pictures(self.path)) > 1:
+            raise VideoError(
+                f"{count} pictures in one file; save them as a folder of pictures, or as a video"
+            )
+        return [self.path]
 
     @property
     def _chosen(self) -> range:
@@ -616,6 +623,16 @@ def _size_of_file(path: Path, _changed: int, _length: int) -> tuple[int, int] | 
     return None
 
 
+def _num_pictures(path: Path) -> int:
+    """How many pictures of one size a file holds, as TIFF and WebP may; a small copy is none."""
+    with suppress(Exception), Image.open(path) as opened:  # see `read_image`
+        size = opened.size
+        opened.seek(1)
+        if opened.format != "MPO" and opened.size == size:  # of a telephone, for two eyes
+            return opened.n_frames  # type: ignore[attr-defined]
+    return 1
+
+
 def read_frame(path: StrPath, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     """Read one frame of a video, or one image.
 
@@ -800,8 +817,15 @@ def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w
     else:
         deep = picture.to_ndarray(format="rgb48le", threads=1)
         image = np.take(levels, np.asarray(deep, np.uint16))
-    quarter_turns = round(picture.rotation / 90)
-    return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
+    # How a pixel's place (x, y) is shown: x' = a x + c y, y' = b x + d y, maybe mirrored.
+    angle = math.radians(picture.rotation)
+    a, b, c, d = math.cos(angle), -math.sin(angle), math.sin(angle), math.cos(angle)
+    with suppress(KeyError, ValueError):  # there is none, or beside it what PyAV does not know
+        data: Any = picture.side_data
+        a, b, _, c, d, *_ = np.frombuffer(data["DISPLAYMATRIX"], np.int32).tolist()
+    if abs(b) > abs(a):
+        image, a, d = image.swapaxes(0, 1), c, b
+    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
 
 
 def _reason(error: Exception) -> str:

@@ -146,7 +146,7 @@ def joints_figure(track: Track, *, camera: Camera | None = None) -> Figure:
     for panels, name, joint in zip(grid, names, chosen, strict=True):
         for axis, axes in enumerate(panels):
             _draw(axes, track, places[:, :, joint, axis], deviation[:, joint, axis])
-        panels[0].set_ylabel(name.replace("_", " "), fontsize=9)
+        panels[0].set_ylabel(name.replace("_", " "), fontsize=9, parse_math=False)
     for axes, direction in zip(grid[0], labels, strict=True):
         axes.set_title(f"{direction} (metres)", fontsize=10)
     for axes in grid[-1]:
@@ -193,7 +193,7 @@ def angles_figure(track: Track) -> Figure:
         for limit in (factor * lower[index], factor * upper[index]):
             if low - 0.3 * (high - low) <= limit <= high + 0.3 * (high - low):
                 axes.axhline(limit, color=OKABE_ITO["vermilion"], lw=1.0, ls=":")
-        axes.set_title(f"{name.replace('_', ' ')} ({unit})", fontsize=8)
+        axes.set_title(f"{name.replace('_', ' ')} ({unit})", fontsize=8, parse_math=False)
     for column in range(columns):
         shown = [axes for axes in grid[:, column] if axes.get_visible()]
         shown[-1].set_xlabel("seconds", fontsize=9)
@@ -260,7 +260,8 @@ def _draw_widest(
         times, range(len(order)), share[:, order].T, cmap="cividis", vmin=0, vmax=1,
         shading="nearest",
     )  # fmt: skip
-    axes.set_yticks(range(len(order)), [names[index] for index in order], fontsize=8)
+    labels = [names[index] for index in order]
+    axes.set_yticks(range(len(order)), labels, fontsize=8, parse_math=False)
     axes.set_ylim(len(order) - 0.5, -0.5)
     axes.set_title("which parameters the widest direction mixes, share of its square", fontsize=10)
     axes.set_xlabel("seconds", fontsize=9)
@@ -277,7 +278,7 @@ def _draw_direction(axes: Axes, direction: np.ndarray, names: list[str]) -> None
         color=[OKABE_ITO["blue" if part > 0 else "orange"] for part in direction[largest]],
     )  # fmt: skip
     axes.axvline(0, color="0.45", lw=0.8)
-    axes.set_yticks(range(len(largest)), [names[index] for index in largest])
+    axes.set_yticks(range(len(largest)), [names[index] for index in largest], parse_math=False)
     axes.invert_yaxis()
     axes.set_xlim(-1.05, 1.05)
     tidy(axes)

@@ -43,7 +43,7 @@ def track_batch(sequences: Sequences) -> Iterator[tuple[Posterior | None, ...]]:
         What is known after each moment, one entry a sequence; None for one that has ended.
 
     Raises:
-        ConfigurationError: If a session is given twice.
+        ConfigurationError: If a session is given twice, or an iterator of images.
         TorchcssError: What is wrong with a sequence, when the others have done the same moment;
             every session then stands after the last moment that it did, as `checkpoint` tells.
     """
@@ -53,8 +53,10 @@ def track_batch(sequences: Sequences) -> Iterator[tuple[Posterior | None, ...]]:
         images.append(iter(its))
     if not sessions:
         return
-    if len(set(map(id, sessions))) < len(sessions):
-        raise ConfigurationError("sequences: each needs a session of its own; one is given twice")
+    if len(set(map(id, sessions))) < len(sessions) or len(set(map(id, images))) < len(images):
+        raise ConfigurationError(
+            "sequences: each needs a session and images of its own; one is given twice"
+        )
     for device in {session.settings.device for session in sessions}:
         # The first call loads a device's solvers, which two threads must not do at once.
         torch.linalg.cholesky_ex(torch.eye(1, device=device))

@@ -94,6 +94,19 @@ def test_mediapipe_json(tmp_path: Path, content: Any) -> None:
     assert any("pixels" in line for line in found.report)
 
 
+@pytest.mark.parametrize("form", ["triples", "fours", "rows", "rows of fours"])
+def test_mediapipe_json_of_plain_numbers(tmp_path: Path, form: str) -> None:
+    """Three numbers of a landmark are x, y and z, of which some are negative: no confidence."""
+    path, has_confidence = tmp_path / "pose.json", "fours" in form
+    values = fractions()[..., : 4 if has_confidence else 3]
+    poses = values.reshape(FRAMES, -1) if "rows" in form else values
+    path.write_text(json.dumps([{"frame": i, "pose": p.tolist()} for i, p in enumerate(poses)]))
+    found = read(path, num_frames=FRAMES)
+    check(found, MARKS, "MediaPipe-33", confidence=has_confidence)
+    told = any("no confidence in the file, but z" in line for line in found.report)
+    assert told == bool((found.confidence == 1).all()) == (not has_confidence)
+
+
 def test_mediapipe_frames_without_a_person(tmp_path: Path) -> None:
     path = tmp_path / "pose.json"
     for nobody in (None, [], {"landmarks": []}, {"landmarks": None}):

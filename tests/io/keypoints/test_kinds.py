@@ -613,7 +613,9 @@ def table(names: tuple[str, ...], ends: tuple[str, str, str], rows: list[list[An
     return "\r\n".join(",".join(map(str, row)) for row in [heading, *rows]) + "\r\n"
 
 
-@pytest.mark.parametrize("end", ["_c", "_score", ".likelihood", "_prob", "_confidence", "_vis"])
+@pytest.mark.parametrize(
+    "end", ["_c", "_score", ".likelihood", "_prob", "_confidence", "_vis", "_accu"]
+)
 def test_confidence_columns(tmp_path: Path, end: str) -> None:
     marks = np.stack([person(t) for t in T])
     marks[2:4, 9] = 0.0
@@ -1789,3 +1791,75 @@ def test_the_size_by_other_words(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "b.csv"  # a person's width and height
     path.write_text("\n".join(["width,height,frame,joint,x,y,score", *rows]))
     check(read(path))
+
+
+@pytest.mark.parametrize("form", ["OpenPose", "COCO"])
+def test_frames_from_the_midst_of_a_video(tmp_path: Path, form: str) -> None:
+    """OpenPose with --frame_first, and pictures of which some are annotated: no earlier frames."""
+    part, path = range(2, 5), tmp_path / "keypoints"
+    for t in part if form == "OpenPose" else ():
+        people = [{"pose_keypoints_2d": flat(t, OPENPOSE)}]
+        write(path / f"clip_{t:012d}_keypoints.json", {"people": people})
+    if form == "COCO":
+        content = {
+            "categories": [{"id": 1, "keypoints": list(TFJS)}],
+            "images": [{"id": 9 - t, "file_name": f"frame_{t:06d}.PNG"} for t in part],
+            "annotations": [
+                {"image_id": 9 - t, "category_id": 1, "keypoints": flat(t)} for t in part
+            ],
+        }
+        write(path, content)
+    with pytest.raises(KeypointError, match="with somebody is 2: start there"):
+        read(path)
+    check(read(path, first_frame=2), (0, 1, 5))
+
+
+def test_everybody_under_one_number(tmp_path: Path) -> None:
+    """AlphaPose without a tracker: the person is the nearest."""
+    entries = [
+        {"image_id": f"{t}.jpg", "keypoints": p.ravel().tolist(), "score": 2, "idx": 0}
+        for t in T
+        for p in ((person(t), other(t)) if t % 2 == 0 else (other(t), person(t)))
+    ]
+    check(read(write(tmp_path / "a.json", entries)))
+
+
+def test_dwpose_as_it_returns_them(tmp_path: Path) -> None:
+    """Places of all people in one list, fractions of the picture; below 0 is who is not there."""
+    frames = [
+        {"bodies": {"candidate": (person(t, OPENPOSE)[:, :2] / (639, 479)).tolist(),
+                    "subset": [[float(n if n != 16 else -1) for n in range(18)]]},
+         "hands": [[[0.1, 0.2]] * 21] * 2, "faces": [[[0.1, 0.2]] * 68]}
+        if t != 3 else {"bodies": {"candidate": [], "subset": []}}
+        for t in T
+    ]  # fmt: skip
+    path = write(tmp_path / "a.json", frames)
+    found = read(path, normalised="zero-one")
+    check(found, (3,))
+    assert not found.confidence[:, found.names.index("r_ear")].any()
+    frames[0]["bodies"]["subset"] = [[0.0] * 20]
+    with pytest.raises(KeypointError, match=r"\[18, 2\] for \[1, 20\]"):
+        read(write(path, frames), normalised="zero-one")
+
+
+def test_frames_of_skeletons(tmp_path: Path) -> None:
+    """Kinetics as ST-GCN has it: pairs in a row, confidences beside."""
+    frames = [
+        {"frame_index": t + 1, "skeleton": [
+            {"pose": p[:, :2].ravel().tolist(), "score": p[:, 2].tolist()}
+            for p in (other(t), person(t))]}
+        for t in T
+    ]  # fmt: skip
+    check(read(write(tmp_path / "a.json", {"data": frames, "label": "walk", "label_index": 3})))
+
+
+def test_yolo_labels_of_all_frames_in_one_file(tmp_path: Path) -> None:
+    """What its tracker leaves when it gets frame after frame: no picture of so many people."""
+    rows = [
+        ["0 .5 .5 .2 .8", *map(str, (p / (*SIZE, 1)).flat), track]
+        for t in T
+        for p, track in ((other(t), "2"), (person(t), "1"))
+    ]
+    write(tmp_path / "image0.txt", "\n".join(map(" ".join, rows)))
+    with pytest.raises(KeypointError, match="12 people under 2 numbers: of several frames"):
+        read(tmp_path)

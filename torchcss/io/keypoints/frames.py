@@ -179,7 +179,9 @@ def _by_number(people: People, keys: Sequence[Key], film: Film, report: list[str
 def _first(people: People, places: Sequence[int], num_frames: int | None) -> int:
     """Which number the first frame has."""
     low, high = min(places, default=0), max(places, default=0)
-    if people.whole or not places:
+    # Numbers from the midst of the video are its own: of the frames that somebody looked at.
+    within = num_frames is not None and 1 < low <= high < num_frames
+    if not places or (people.whole and not within):
         return low
     if num_frames is not None and high - low + 1 == num_frames and low > 1:
         return low

@@ -37,7 +37,7 @@ from torchcss.io.keypoints.json_people import (
     said_size,
     scored,
 )
-from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
+from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered, without_depth
 from torchcss.io.keypoints.people import (
     Frames,
     Key,
@@ -168,10 +168,12 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
         for people in frames.values():
             people[:] = [p._replace(track=p.track or f"{n}") for n, p in enumerate(people)]
     frames, names = reordered(frames, names or ())
-    found = list(frames.values()) if in_order else frames
+    report, layout = [f"format: {name}"], None
     if names is None and NUM_LANDMARKS in joint_counts(frames):
-        return People(found, None, ["format: MediaPipe landmarks"], LAYOUT, corner_fractions=True)
-    return People(found, names, [f"format: {name}"])
+        report, layout = ["format: MediaPipe landmarks"], LAYOUT
+        frames = without_depth(frames, report)
+    found = list(frames.values()) if in_order else frames
+    return People(found, names, report, layout, corner_fractions=layout == LAYOUT)
 
 
 def _plain_array(content: object) -> np.ndarray | None:

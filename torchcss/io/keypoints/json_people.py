@@ -19,6 +19,7 @@ import numpy as np
 from torchcss.errors import KeypointError
 from torchcss.files import unexpected
 from torchcss.io.keypoints.annotated import labelme_people
+from torchcss.io.keypoints.mediapipe import FOURS
 from torchcss.io.keypoints.people import (
     LAYOUT_SIZES,
     MOST_JOINTS,
@@ -42,7 +43,7 @@ from torchcss.joint_names import names_in
 PEOPLE = names_in(
     "people bodies instances instanceinfo predictions annots poses persons players detections body"
 )
-_OBJECTS = names_in("bodylist objects")
+_OBJECTS = names_in("bodylist objects skeletons skeleton")
 """The same, where no joints stand beside it: other programs' objects are boxes."""
 
 JOINTS = names_in(
@@ -76,6 +77,8 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
         if (key := key_of(value, PEOPLE)) is not None:
             if not isinstance(value[key], (list, dict, type(None))):
                 raise KeypointError(f"{where}: expected a list {key!r}")
+            if isinstance(value[key], dict) and {"candidate", "subset"} <= value[key].keys():
+                return _of_candidates(f"{where}: {key}", value[key])
             return people_of(f"{where}: {key}", value[key])
         if (key := key_of(value, JOINTS)) is not None:
             inner = value[key]
@@ -112,6 +115,21 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             for person in people_of(f"{where}[{index}]", each)
         ]
     raise unexpected(KeypointError, where, "people with keypoints", value)
+
+
+def _of_candidates(where: str, value: Mapping[str, Any]) -> list[Person]:
+    """The people of DWPose as it returns them, who have a number below 0 where a place is none."""
+    if not value["candidate"]:
+        return []
+    places = number_array(value["candidate"], f"{where}: candidate")
+    numbers = number_array(value["subset"], f"{where}: subset")
+    if numbers.shape[1:] != (18,) or places.shape != (numbers.size, 2):
+        raise KeypointError(
+            f"{where}: expected a candidate x, y for each of the 18 numbers of everyone in subset, "
+            f"found {list(places.shape)} for {list(numbers.shape)}"
+        )
+    places = np.where(numbers.reshape(-1, 1) < 0, np.nan, places)
+    return [Person(screened(own)) for own in np.split(places, len(numbers))]
 
 
 def scored(people: list[Any], around: Mapping[str, Any]) -> list[Any]:
@@ -219,7 +237,9 @@ def listed(value: object) -> list[Any]:
 
 
 def _in_a_row(where: str, values: np.ndarray, scores: object) -> np.ndarray:
-    """Joints from a row of triples, or of pairs with their confidences beside it."""
+    """Joints from a row of triples, of MediaPipe's fours, or of pairs with confidences beside."""
+    if values.shape == FOURS[1]:  # x, y, z, visibility
+        return values.reshape(FOURS[0])[:, [0, 1, 3]]
     triples = values.size % 3 == 0 and values.size // 3 in LAYOUT_SIZES
     alone = not triples and values.size % 2 == 0 and values.size // 2 in LAYOUT_SIZES
     pairs = values.size == 2 * len(scores) if isinstance(scores, list) else alone

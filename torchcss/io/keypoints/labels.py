@@ -35,6 +35,13 @@ def read_labels(folder: Path, image_size_wh: Size) -> People:
             for number, line in enumerate(lines, start=1)
             if line.strip()
         ]
+        numbers = [person.track for person in frames[plain_name(file.name)]]
+        if len(files) == 1 and 1 < len({*numbers} - {None}) < len(numbers) / 2:
+            raise KeypointError(
+                f"{file}: {len(numbers)} people under {len({*numbers})} numbers: of several "
+                "frames, it seems; expected a file for each, as model.track(VIDEO, save_txt=True) "
+                "writes"
+            )
     return People(frames, None, [f"format: YOLO, {len(files)} files"], first=1)
 
 

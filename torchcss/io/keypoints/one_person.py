@@ -149,15 +149,17 @@ def _next(
         last: The person where it was seen last.
         people: Everybody of the frame.
         tracks: Their tracks.
-        track: The person's track; its frame is known if it is there.
+        track: The person's track; who has it is the person, or of several the nearest.
         others: Tracks seen so far, which are other people.
         missed: Frames since the person was seen.
     """
     seen = [index for index, person in enumerate(people) if (person[:, 2] > 0.0).any()]
-    if track is not None and track in tracks and tracks.index(track) in seen:
-        return tracks.index(track)
     if track is not None:
-        seen = [index for index in seen if tracks[index] not in others]
+        same = [index for index in seen if tracks[index] == track]
+        if len(same) == 1:
+            return same[0]
+        # Some programs number everybody alike.
+        seen = same or [index for index in seen if tracks[index] not in others]
     distances = {index: _distance(last, people[index]) for index in seen}
     nearest = min(distances, key=distances.__getitem__, default=None)
     # After frames without the person it may have gone farther.

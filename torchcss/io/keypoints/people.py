@@ -63,7 +63,8 @@ class People(NamedTuple):
         layout: The layout, where the format says it.
         corner_fractions: Coordinates are pixels, or fractions of the image from its corner.
         first: The number of the first frame, where the format says it.
-        whole: All frames are there that were looked at: the lowest number is the first frame.
+        whole: All frames are there that were looked at: the lowest number is the first frame, but
+            where the video goes on before and behind them.
         size_wh: Size of the images in which the file's pixels count, if it says so.
         relative_noise: Standard deviation of a place of confidence 1, in multiples of what
             detectors have.

@@ -64,6 +64,7 @@ from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
 from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
 from torchcss.io.keypoints.sides import with_sides_put_back
 from torchcss.io.keypoints.tables import json_of_rows, people_of_rows, table_rows
+from torchcss.io.video import VIDEO_SUFFIXES
 from torchcss.joint_names import (
     ALIASES,
     JOINT_NAMES,
@@ -80,7 +81,7 @@ _AS_CSV = "save it as CSV"
 _OTHERS = {
     ".pkl .pickle .pt .pth .joblib": "a pickle, from which code may run: not read; save the arrays "
     "with numpy.savez(FILE, keypoints=..., confidence=..., joint_names=...)",
-    ".mp4 .mov .avi .mkv .webm .m4v .mpg .mpeg .wmv .mts": "a video; torchcss detect VIDEO --out "
+    " ".join(VIDEO_SUFFIXES): "a video; torchcss detect VIDEO --out "
     "keypoints.npz finds the keypoints in it",
     ".jpg .jpeg .png .bmp .tif .tiff .webp": "a picture; torchcss init PICTURE --click marks its "
     "joints",

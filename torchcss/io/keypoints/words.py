@@ -52,7 +52,7 @@ VIDEOS = names_in(
 
 CONFIDENCES = names_in(
     "confidence conf confidencescore c score s keypointscore kptscore likelihood p prob "
-    "probability certainty visibility visible vis v presence inframelikelihood"
+    "probability certainty accuracy accu visibility visible vis v presence inframelikelihood"
 )
 """The confidence of a joint, the best first where there are several."""
 
