@@ -24,6 +24,15 @@ def test_a_frame_of_keypoints() -> None:
     assert keypoints.at(torch.tensor([1, 0])).confidence[1].tolist() == [1.0, 0.5, 0.0]
 
 
+def test_a_joint_that_is_nowhere_is_not_known() -> None:
+    keypoints = two_frames()
+    nowhere = keypoints.positions.clone()
+    nowhere[0, 0, 1], nowhere[0, 1, 0] = torch.nan, torch.inf
+    assert keypoints.known.tolist() == [[True, True, False], [False] * 3]
+    assert keypoints._replace(positions=nowhere).says_nothing
+    assert not keypoints.says_nothing
+
+
 def test_keypoints_of_some_joints() -> None:
     kept = two_frames().only(("l_wrist", "nose", "r_wrist"))
     assert kept.names == ("nose", "l_wrist")

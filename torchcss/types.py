@@ -235,9 +235,14 @@ class Keypoints(NamedTuple):
     points: Float[Tensor, "*t j 3"] | None = None
 
     @property
+    def known(self) -> Bool[Tensor, "*t j"]:
+        """Which joints are known: those of some confidence that are somewhere."""
+        return (self.confidence > 0) & self.positions.isfinite().all(-1)
+
+    @property
     def says_nothing(self) -> bool:
         """Whether no joint is known, as in a frame in which nobody was detected."""
-        return not bool((self.confidence > 0).any())
+        return not bool(self.known.any())
 
     def at(self, frame: int | Int[Tensor, " s"]) -> Self:
         """The keypoints of one frame, or of some."""

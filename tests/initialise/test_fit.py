@@ -565,8 +565,10 @@ def test_typical_sigma_is_that_of_the_middle_frame():
     keypoints = Keypoints(places, confidence, ("l_wrist", "r_wrist", "nose"))
     assert typical_sigma(keypoints) == pytest.approx(6.0)
     assert typical_sigma(keypoints.at(torch.tensor([0, 1]))) == pytest.approx(4.5)
-    with pytest.raises(KeypointError, match="no frame has two keypoints"):
-        typical_sigma(keypoints.at(torch.tensor([3])))
+    nowhere = keypoints._replace(positions=places.index_fill(1, torch.tensor([0, 1]), torch.nan))
+    for frame in (keypoints, 3), (nowhere, 1):
+        with pytest.raises(KeypointError, match="no frame has two keypoints"):
+            typical_sigma(frame[0].at(torch.tensor([frame[1]])))
 
 
 def test_public_name():

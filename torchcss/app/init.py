@@ -242,7 +242,7 @@ def _draw(
 ) -> None:
     from torchcss.show.initialisation_views import draw_hypotheses
 
-    known = torch.where(keypoints.confidence[:, None] > 0, keypoints.positions, torch.nan)
+    known = torch.where(keypoints.known[:, None], keypoints.positions, torch.nan)
     pictures = {
         f"stage{number}.png": draw_poses(
             picture, stage.body, stage.state[None], camera, keypoints=known,

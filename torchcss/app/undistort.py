@@ -131,7 +131,7 @@ def _straight_keypoints(
     """The arrays of straight keypoints, and a line about those that no straight picture shows."""
     pixels, reached = straightened(keypoints.positions.numpy(), K)
     confidence = keypoints.confidence.numpy()
-    lost = (confidence > 0) & ~reached
+    lost = keypoints.known.numpy() & ~reached
     arrays = {
         "keypoints": np.where(reached[..., None], pixels, 0.0),
         "confidence": np.where(reached, confidence, 0.0),

@@ -73,7 +73,7 @@ def match_joints(keypoints: Keypoints, joint_names: tuple[str, ...]) -> JointTar
     """
     columns, joints, spread = _pairs(keypoints.names, joint_names)
     place, confidence = keypoints.positions[..., columns, :], keypoints.confidence[..., columns]
-    known = (confidence > 0) & place.isfinite().all(-1)
+    known = keypoints.known[..., columns]
     weight = torch.where(known, confidence.clamp(0, 1), 0.0)
     noise = keypoints.relative_noise * place.new_tensor(spread)
     return JointTargets(

@@ -168,7 +168,7 @@ def _misses(alone: TrackingCost, x: Vector) -> str | None:
     joints, given = alone.choice.find(JointTerm), alone.keypoints
     error = 2 * x.new_tensor(_POOR_FIT * joints.sigma).square()
     most = alone.choice.weight(joints.name) * joints.weight * 0.5 * joints.potential(error).rho
-    if alone.terms(x[None])[joints.name] <= most * (given.confidence > 0).sum():
+    if alone.terms(x[None])[joints.name] <= most * given.known.sum():
         return None
     return (
         f"keypoints: the best fit misses them by more than {_POOR_FIT:g} times the noise of "

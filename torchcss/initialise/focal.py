@@ -81,7 +81,7 @@ def fit_focal(
     longer = max(image_size_wh)
     free = load_body(body, dtype=options.dtype, free_proportions=True, free_root=True)
     keypoints = keypoints.only(free.joint_names).to(free.tie)
-    usable = torch.nonzero((keypoints.confidence > 0).sum(-1) >= _LEAST_JOINTS)[:, 0]
+    usable = torch.nonzero(keypoints.known.sum(-1) >= _LEAST_JOINTS)[:, 0]
     if len(usable) < _LEAST_FRAMES:
         return Focal(math.exp(MEAN) * longer, DEVIATION, 0)
     spread = torch.linspace(0, len(usable) - 1, min(MOST_FRAMES, len(usable))).round().long()

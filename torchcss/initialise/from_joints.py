@@ -92,7 +92,6 @@ def fit_joints(
         check_stature(free.name, options.stature)
     assert view.keypoints is not None
     keypoints = view.keypoints.only(free.joint_names).to(free.tie)
-    keypoints = keypoints.without(~keypoints.positions.isfinite().all(-1))
     notes = (*free.notes, *check_keypoints(free.name, keypoints, view.camera, options.least_joints))
     cost = options.joint_cost(free, (view._replace(keypoints=keypoints), *others))
     if isinstance(body, BodyModel):

@@ -47,7 +47,7 @@ def start_from_points(
         return starts[:0]
     # The columns of R are the world's axes: a row times R is in the world.
     points = keypoints.points.to(body.tie) @ camera.R_camera_world.to(body.tie)
-    known = (keypoints.confidence > 0) & points.isfinite().all(-1)
+    known = keypoints.known & points.isfinite().all(-1)
     if int(known.sum()) < _LEAST_JOINTS:
         return starts[:0]
     joint = torch.tensor(body.joint_columns(names), device=known.device)

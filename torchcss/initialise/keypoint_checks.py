@@ -90,8 +90,7 @@ def default_sigma(keypoints: Keypoints) -> float:
 
     Detectors err in proportion to the person's size in the image. At least one pixel.
     """
-    places = keypoints.positions[keypoints.confidence > 0]
-    places = places[places.isfinite().all(-1)]
+    places = keypoints.positions[keypoints.known]
     if len(places) < 2:
         return 3.0
     return max(1.0, 0.006 * float((places.amax(0) - places.amin(0)).norm()))
@@ -103,7 +102,7 @@ def typical_sigma(keypoints: Keypoints) -> float:
     Raises:
         KeypointError: If no frame has two keypoints.
     """
-    known = (keypoints.confidence > 0).sum(-1) >= 2
+    known = keypoints.known.sum(-1) >= 2
     sizes = [default_sigma(keypoints.at(t)) for t in torch.nonzero(known)[:, 0].tolist()]
     if not sizes:
         raise KeypointError(
@@ -128,7 +127,7 @@ def check_keypoints(name: str, keypoints: Keypoints, camera: Camera, least: int)
     Raises:
         KeypointError: If too few joints are seen, or all are at one place.
     """
-    seen = keypoints.confidence > 0
+    seen = keypoints.known
     places = keypoints.positions[seen]
     names = [keypoints.names[column] for column in torch.nonzero(seen)[:, 0].tolist()]
     if len(names) < least:
@@ -166,7 +165,7 @@ def swapped_sides(cost: TrackingCost, x: Vector, generator: torch.Generator) -> 
     given = cost.keypoints
     # Exchanged keypoints may have been left out as outliers, which has its price too.
     best = float(capped_cost(cost, x))
-    if best < _SUSPICIOUS * int((given.confidence > 0).sum()) or not has_root(cost.body):
+    if best < _SUSPICIOUS * int(given.known.sum()) or not has_root(cost.body):
         return ()
     quick = StartSearch(num_starts=24, num_flips=0, num_samples=0, max_steps=30)
     costs: dict[str, float] = {}
