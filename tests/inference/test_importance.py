@@ -11,7 +11,7 @@ from torchcss.inference.importance import (
     survival,
     tempered_log_weight,
 )
-from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.proposals import CovarianceScaled, EigenDirectionGrid, Samples
 
 PRIOR = GaussianMixture(
@@ -108,3 +108,15 @@ def test_patterns_and_failures_have_no_weight(generator):
     fair = fair_samples(samples, log_weight, 20, generator=generator)
     assert isinstance(fair, Samples)
     assert bool((fair.x[:, 0] > 0).all())
+
+
+def test_fair_samples_keep_what_their_parents_are_and_where_they_were_drawn(generator):
+    jump = Prior(PRIOR._replace(mean=PRIOR.mean + 5), torch.zeros(1, dtype=torch.long))
+    places = torch.arange(6.0).double().reshape(3, 2)
+    parent = torch.tensor([0, 1, 1])
+    samples = Samples(places, parent, torch.zeros(3).double(), jump, places + 0.5)
+    fair = fair_samples(samples, samples.log_weight, 12, generator=generator)
+    assert fair.jumps is jump
+    assert sorted(set(fair.parent.tolist())) == [0, 1]
+    assert fair.drawn is not None
+    assert torch.equal(fair.drawn, fair.x + 0.5)

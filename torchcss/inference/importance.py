@@ -128,4 +128,4 @@ def fair_samples(
         generator: Source of randomness.
     """
     chosen = resample(log_weight, num, generator=generator)
-    return Samples(samples.x[chosen], samples.parent[chosen], torch.zeros_like(log_weight[chosen]))
+    return samples.take(chosen)._replace(log_weight=torch.zeros_like(log_weight[chosen]))
