@@ -108,6 +108,37 @@ def check_positive(choice: object, *names: str, hint: str = "", finite: bool = F
             raise ConfigurationError(f"{where}: expected a positive number, got {value}{hint}")
 
 
+def check_range(
+    choice: object,
+    *names: str,
+    least: float = 0.0,
+    most: float = math.inf,
+    hint: str = "",
+    finite: bool = True,
+) -> None:
+    """Check that attributes of a choice lie in a range, both ends included, or are None.
+
+    Args:
+        choice: A record of choices.
+        names: Its attributes: a number each, or several of which each is to lie there.
+        least: The lower end.
+        most: The upper end.
+        hint: What to do, for the message.
+        finite: Infinity is no number.
+
+    Raises:
+        ConfigurationError: If one does not.
+    """
+    span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+    for name in names:
+        value = getattr(choice, name)
+        numbers = torch.as_tensor(() if value is None else value, dtype=torch.float64)
+        fits = (numbers >= least) & (numbers <= most) & (numbers.isfinite() | (not finite))
+        if not bool(fits.all()):
+            where = f"{type(choice).__name__}.{name}"
+            raise ConfigurationError(f"{where}: expected {span}, got {value}{hint}")
+
+
 def check_device(device: torch.device | str) -> None:
     """Check that there is a device.
 

@@ -237,10 +237,14 @@ def test_bad_choices():
     for bad, match in [
         ({"dilution": 2.0}, "dilution"),
         ({"noise_scale": 0.5}, "narrower"),
+        ({"noise_scale": torch.inf}, "noise_scale: expected at least 1, got inf"),
         ({"num_samples": 0}, "num_samples"),
     ]:
         with pytest.raises(ConfigurationError, match=match):
             make(ParticleFilter, **bad)
-    for bad, match in [({"num_layers": 0}, "num_layers"), ({"survival_rate": 1.0}, "survival")]:
+    for bad, match in [
+        ({"num_layers": torch.nan}, "num_layers"),
+        ({"survival_rate": 1.0}, "survival"),
+    ]:
         with pytest.raises(ConfigurationError, match=match):
             make(AnnealedParticleFilter, **bad)

@@ -431,12 +431,23 @@ def test_bad_choices():
         (lambda: Condensation(deviation=-1.0), "Condensation.deviation"),
         (lambda: ChamRehg(deviation=(1.0, math.nan)), "ChamRehg.deviation"),
         (lambda: InflatedPosterior(covariance_scale=2, deviation=math.inf), "deviation"),
+        (lambda: CovarianceScaled(covariance_scale=2, max_deviation=-1.0), "max_deviation"),
+        (lambda: HeavyTailed(covariance_scale=2, max_deviation=(1.0, math.nan)), "max_deviation"),
+        (lambda: HeavyTailed(covariance_scale=2, degrees_of_freedom=0), "at least 1, got 0; 3 is"),
+        (lambda: EigenDirectionGrid(num_directions=-1), "Grid.num_directions: expected at least 1"),
+        (lambda: EigenDirectionGrid(num_steps=0), "Grid.num_steps: expected at least 1"),
+        (lambda: EigenDirectionGrid(deviation_scale=math.nan), "Grid.deviation_scale"),
+        (lambda: Diffusion(deviation=-0.1), "Diffusion.deviation: expected at least 0"),
+        (lambda: ConstantVelocity(deviation=(0.1, math.inf)), "ConstantVelocity.deviation"),
+        (lambda: ConstantVelocity(persistence=math.nan), "ConstantVelocity.persistence"),
         (lambda: MixtureOfProposals(proposals=()), "at least one"),
         (lambda: MixtureOfProposals(proposals=(ALL[0],), shares=(0.0,)), "shares"),
         (lambda: MixtureOfProposals(proposals=(ALL[0],), shares=(0.5, 0.5)), "one share for each"),
     ]:
         with pytest.raises(ConfigurationError, match=match):
             make()
+    free = CovarianceScaled(covariance_scale=2, max_deviation=(1.0, math.inf))  # of one parameter
+    assert free.max_deviation == (1.0, math.inf)
 
 
 def test_dynamics():

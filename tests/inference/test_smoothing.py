@@ -547,6 +547,13 @@ def test_bad_windows_are_refused():
         refine_in_windows(one_by_one(gaussian(4, 2)), *arguments)
 
 
+@pytest.mark.parametrize("name", ["likelihood_power", "max_steps", "tolerance"])
+@pytest.mark.parametrize("number", [-1.0, math.nan, math.inf])
+def test_refinements_out_of_range_are_refused(name: str, number: float) -> None:
+    with pytest.raises(ConfigurationError, match=f"Refinement.{name}: expected"):
+        Refinement(**{name: number})
+
+
 def refined(dtype: torch.dtype) -> Refined:
     evidence = gaussian(8, 3)
     return refine(

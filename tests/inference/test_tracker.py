@@ -284,6 +284,13 @@ def test_bad_input(generator):
     for power in (0.0, -1.0, torch.inf):
         with pytest.raises(ConfigurationError, match=r"Tracker\.likelihood_power: expected"):
             replace(CSS, likelihood_power=power)
+    for name in ("survivors", "separation", "coarse_every"):
+        for number in (-1, torch.nan, torch.inf):
+            with pytest.raises(ConfigurationError, match=rf"Tracker\.{name}: expected at least 0"):
+                replace(CSS, **{name: number})
+    for number in (-0.1, 1.1, torch.nan):
+        with pytest.raises(ConfigurationError, match=r"Tracker\.forgetting: expected 0 to 1, got"):
+            replace(CSS, forgetting=number)
     with pytest.raises(ConfigurationError, match="num_samples"):
         Tracker(proposal=CSS.proposal, num_samples=0, num_modes=1)
     with pytest.raises(ShapeError, match=r"mixture.covariance.*\[..., 1, 2, 2\]"):

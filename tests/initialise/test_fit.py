@@ -500,6 +500,12 @@ def test_only_the_papers_proportions_if_asked():
         StartSearch(proportions=("tail",))
 
 
+@pytest.mark.parametrize("name", ["num_starts", "num_flips", "max_steps", "covariance_scale"])
+def test_searches_out_of_range_are_refused(name: str):
+    with pytest.raises(ConfigurationError, match=f"StartSearch.{name}: expected"):
+        StartSearch(**{name: torch.nan})
+
+
 def test_the_papers_stages_are_one_fit_that_keeps_parts_apart():
     options = InitialiseOptions(search=replace(SMALL, coarse_pose={"root_yaw": 1.0})).as_papers()
     assert options.search == replace(PAPERS, coarse_pose={"root_yaw": 1.0})

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.errors import check_range
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.types import Matrices, Vectors, frozen
 
@@ -68,6 +69,9 @@ class Diffusion:
 
     deviation: Deviation = 0.0
 
+    def __post_init__(self) -> None:
+        check_range(self, "deviation")
+
     def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Add the variance of the motion; the velocity is not used."""
         motion = noise_covariance(self.deviation, mixture.covariance)
@@ -84,11 +88,15 @@ class ConstantVelocity:
 
     Attributes:
         deviation: Standard deviation of the change of velocity, as in `Diffusion`.
-        persistence: Share of the velocity that is kept, from 0 (diffusion) to 1.
+        persistence: Share of the velocity that is kept, from 0 (diffusion) to 1; over several
+            intervals it is in units of one, and may be more.
     """
 
     deviation: Deviation = 0.0
     persistence: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_range(self, "deviation", "persistence")
 
     def predict(self, mixture: GaussianMixture, velocity: Vectors) -> GaussianMixture:
         """Add the velocity to the means and the variance of its change to the covariances."""

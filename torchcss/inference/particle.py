@@ -35,7 +35,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_range
 from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import (
     normalised_log_weight,
@@ -222,15 +222,11 @@ class ParticleFilter(_Filter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.dilution <= 1:
-            raise ConfigurationError(
-                f"ParticleFilter.dilution: expected 0 to 1, got {self.dilution}"
-            )
-        if not self.noise_scale >= 1:
-            raise ConfigurationError(
-                f"ParticleFilter.noise_scale: expected at least 1, got {self.noise_scale}; "
-                "narrower noise than the dynamics' cannot be weighed back"
-            )
+        check_range(self, "dilution", most=1)
+        check_range(
+            self, "noise_scale", least=1,
+            hint="; narrower noise than the dynamics' cannot be weighed back",
+        )  # fmt: skip
 
     def _weigh(
         self,
@@ -278,10 +274,7 @@ class AnnealedParticleFilter(_Filter):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.num_layers < 1:
-            raise ConfigurationError(
-                f"AnnealedParticleFilter.num_layers: expected at least 1, got {self.num_layers}"
-            )
+        check_range(self, "num_layers", least=1)
         if not 0 < self.survival_rate < 1:
             raise ConfigurationError(
                 "AnnealedParticleFilter.survival_rate: expected more than 0 and less than 1, "

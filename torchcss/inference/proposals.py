@@ -44,7 +44,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_positive, check_range
 from torchcss.inference.dynamics import Deviation, noise_covariance, summed
 from torchcss.inference.mixture import GaussianMixture, MixtureSamples, Prior
 from torchcss.linalg import cholesky_apply, log_determinant, mask_free, multiply
@@ -117,14 +117,6 @@ def _capped(covariance: Matrices, max_deviation: Deviation | None) -> Matrices:
     deviation = torch.linalg.diagonal(covariance).clamp(min=0).sqrt()
     shrink = torch.where(deviation > limit, limit / deviation, 1.0)
     return covariance * shrink[..., :, None] * shrink[..., None, :]
-
-
-def _check_deviation(deviation: Deviation, name: str) -> None:
-    parts = deviation if isinstance(deviation, tuple) else (deviation,)
-    if not all(math.isfinite(part) and part >= 0 for part in parts):
-        raise ConfigurationError(
-            f"{name}.deviation: expected standard deviations, none negative, got {deviation}"
-        )
 
 
 _STATES_AT_ONCE = 1024
@@ -371,6 +363,10 @@ class CovarianceScaled(ScaledProposal):
 
     max_deviation: Deviation | None = None
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "max_deviation", finite=False)
+
     def law(self, mixture: GaussianMixture) -> _Law:
         """Gaussians, inflated."""
         if self._factor == 1 and self.max_deviation is None:
@@ -399,11 +395,8 @@ class HeavyTailed(ScaledProposal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.degrees_of_freedom < 1:
-            raise ConfigurationError(
-                f"HeavyTailed.degrees_of_freedom: expected at least 1, "
-                f"got {self.degrees_of_freedom}; 3 is usual"
-            )
+        check_range(self, "max_deviation", finite=False)
+        check_range(self, "degrees_of_freedom", least=1, hint="; 3 is usual")
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Student t's, inflated."""
@@ -454,7 +447,7 @@ class Condensation(_RandomProposal):
     deviation: Deviation
 
     def __post_init__(self) -> None:
-        _check_deviation(self.deviation, "Condensation")
+        check_range(self, "deviation")
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Noise about every mode."""
@@ -489,7 +482,7 @@ class ChamRehg(_RandomProposal):
     piecewise: bool = True
 
     def __post_init__(self) -> None:
-        _check_deviation(self.deviation, "ChamRehg")
+        check_range(self, "deviation")
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Gaussians widened by noise, each in its own piece of the state space."""
@@ -523,7 +516,7 @@ class InflatedPosterior(ScaledProposal):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_deviation(self.deviation, "InflatedPosterior")
+        check_range(self, "deviation")
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Inflated Gaussians with diluted weights."""
@@ -556,6 +549,10 @@ class EigenDirectionGrid(Proposal):
     num_directions: int = 3
     num_steps: int = 1
     deviation_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_range(self, "num_directions", "num_steps", least=1)
+        check_positive(self, "deviation_scale", finite=True)
 
     def sample(
         self, mixture: GaussianMixture, num: int, bounds: Bounds, *, generator: torch.Generator

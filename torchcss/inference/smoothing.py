@@ -44,7 +44,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, ShapeError, check_shape
+from torchcss.errors import ConfigurationError, ShapeError, check_positive, check_range, check_shape
 from torchcss.inference.chain import (
     Chain,
     ChainSum,
@@ -275,6 +275,10 @@ class Refinement:
     prior_variance: Vector | None = None
     max_steps: int = 50
     tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        check_positive(self, "likelihood_power", finite=True)
+        check_range(self, "max_steps", "tolerance")
 
 
 TO_CONVERGENCE = Refinement()

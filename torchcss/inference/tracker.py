@@ -31,7 +31,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError, check_positive, check_shape
+from torchcss.errors import ConfigurationError, check_positive, check_range, check_shape
 from torchcss.inference.dynamics import Diffusion, Dynamics
 from torchcss.inference.importance import Survival, survival
 from torchcss.inference.marginal import information_of_past
@@ -173,7 +173,7 @@ class SequenceTracker(ABC):
     num_modes: int
 
     def __post_init__(self) -> None:
-        check_positive(self, "num_samples", "num_modes")
+        check_range(self, "num_samples", "num_modes", least=1)
 
     @property
     def stated_power(self) -> float:
@@ -361,10 +361,11 @@ class Tracker(SequenceTracker):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(self, "oversampling", "surprise")
+        check_positive(self, "surprise")
+        check_range(self, "oversampling", least=1)
+        check_range(self, "coarse_every", "survivors", "separation")
+        check_range(self, "forgetting", most=1)
         check_positive(self, "likelihood_power", finite=True)
-        if not 0 <= self.forgetting <= 1:
-            raise ConfigurationError(f"Tracker.forgetting: expected 0 to 1, got {self.forgetting}")
 
     @property
     def stated_power(self) -> float:

@@ -40,7 +40,7 @@ from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import ConfigurationError
+from torchcss.errors import ConfigurationError, check_positive, check_range
 from torchcss.inference.mixture import GaussianMixture, cheapest_first, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -98,12 +98,9 @@ class StartSearch:
     turn: bool = False
 
     def __post_init__(self) -> None:
-        for name, least in (("num_starts", 1), ("num_trunks", 1), ("num_flips", 0),
-                            ("num_samples", 0), ("max_steps", 1)):  # fmt: skip
-            if getattr(self, name) < least:
-                raise ConfigurationError(
-                    f"StartSearch.{name}: expected at least {least}, got {getattr(self, name)}"
-                )
+        check_range(self, "num_starts", "num_trunks", "max_steps", least=1)
+        check_range(self, "num_flips", "num_samples")
+        check_positive(self, "covariance_scale", finite=True)
         known = (*PROPORTIONS, *PLACES)
         if unknown := sorted(set(self.proportions) - set(known)):
             raise ConfigurationError(
