@@ -71,6 +71,14 @@ def test_a_live_recording_is_the_track(files: Path, monkeypatch: pytest.MonkeyPa
     assert np.abs(np.asarray(shown).astype(float) - film[2]).mean() < 6
 
 
+def test_what_was_recorded_before_is_kept(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    saved = files / "live.rrd"
+    saved.write_bytes(b"frames")
+    assert track(files, "--resume", "--live-save", str(saved)) == 2
+    assert "live.rrd: holds what was recorded before" in capsys.readouterr().err
+    assert saved.read_bytes() == b"frames"
+
+
 class Watcher:
     """A sink that remembers, and may fail."""
 

@@ -284,6 +284,17 @@ def test_another_camera_is_refused(clip: Path, whole: Run, tmp_path: Path) -> No
             )  # fmt: skip
 
 
+def test_another_first_pose_is_refused(clip: Path, whole: Run, filmed: Run, tmp_path: Path) -> None:
+    given = (clip / "first" / "body.npz").read_bytes()
+    (tmp_path / "body.npz").write_bytes(given)
+    assert len(follow(clip, whole.folder, init=tmp_path, resume=True).track.frames) == FRAMES
+    (tmp_path / "body.npz").write_bytes(given[:-1] + bytes([given[-1] ^ 1]))
+    with pytest.raises(ConfigurationError, match=r"begun with --init .*first.body\.npz, now .* is"):
+        follow(clip, whole.folder, init=tmp_path, resume=True)
+    with pytest.raises(ConfigurationError, match="begun without --init, now"):
+        follow(clip, filmed.folder, FILMED, resume=True)
+
+
 def test_other_files_are_refused(clip: Path, whole: Run, tmp_path: Path) -> None:
     """Not the old track told as that of another video."""
     files = {"video": clip / "video.mp4", "keypoints": clip / "keypoints2d.npz"}

@@ -8,7 +8,7 @@ comes out as it goes.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import islice
@@ -40,7 +40,7 @@ from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader
-from torchcss.io.view_files import ViewFiles
+from torchcss.io.view_files import ViewFiles, fingerprint
 from torchcss.joint_names import JOINT_NAMES
 from torchcss.show.track_pictures import write_overlays
 from torchcss.tracking.checkpoint import state_from_tensors
@@ -199,7 +199,7 @@ def _begin(
         frame_interval=interval,
         size_deviation=_size_deviation(settings, first, len(views)),
         notes=notes,
-        extra=_description(views, first, selection),
+        extra=_description(views, first, selection, options.init),
         sinks=() if options.live is None else (options.live,),
         on_first_frame=None if is_given else partial(write_fitted_body, body, first, eye),
         checkpoint_every=options.checkpoint_every,
@@ -406,10 +406,13 @@ def _with_files(
 ) -> Run:
     """The run with its files where they are now; others than it was begun with are refused."""
     assert run.checkpoint is not None
-    known = run.checkpoint.notes["extra"].get("fingerprints", ())
+    told = run.checkpoint.notes["extra"]
+    known = told.get("fingerprints", ())
     own = _files_of(video, keypoints, options)
     cameras = list(run.cameras)
     with naming(run.folder, ConfigurationError):
+        if options.init is not None and "first_pose" in told:
+            _check_first_pose(told["first_pose"], Path(options.init))
         if len(options.others) >= len(cameras):
             raise ConfigurationError(f"the run was begun with {len(cameras)} cameras, not more")
         for place, given in enumerate((own, *options.others)):
@@ -440,6 +443,21 @@ def _check_same_options(files: ViewFiles, given: ViewFiles) -> None:
             f"the run was begun with {'; '.join(other)}; give the same, or leave --resume out to "
             "start anew"
         )
+
+
+def _check_first_pose(known: Mapping[str, str] | None, given: Path) -> None:
+    """Refuse another first pose than a run was begun with."""
+    if known is None or known["fingerprint"] != _print_of_pose(given):
+        begun = "without --init" if known is None else f"with --init {known['file']}"
+        raise ConfigurationError(
+            f"the run was begun {begun}, now {given} is another first pose; give the same, or "
+            "leave --resume out to start anew"
+        )
+
+
+def _print_of_pose(path: Path) -> str:
+    """What tells a fitted body from others, given as its file or as the folder that holds it."""
+    return fingerprint(path / FITTED_BODY_NAME if path.is_dir() else path)
 
 
 def _check_camera(
@@ -539,7 +557,7 @@ _SAME_STATURE = 0.02
 
 
 def _description(
-    views: Sequence[OpenView], first: Initialisation, selection: FrameSelection
+    views: Sequence[OpenView], first: Initialisation, selection: FrameSelection, init: Path | None
 ) -> dict[str, Any]:
     """Entries of the summary about the files."""
     return {
@@ -548,6 +566,7 @@ def _description(
         "body_lengths_m": dict(first.body.lengths),
         "frames_selected": asdict(selection),
         "fingerprints": [opened.files.fingerprints() for opened in views],
+        "first_pose": init and {"file": str(init), "fingerprint": _print_of_pose(Path(init))},
     }
 
 

@@ -84,6 +84,12 @@ class Track:
                 "--overwrite replaces it, --out names another folder"
             )
         live, save, connect = None, self.live_save, self.live_connect
+        if self.options.resume and save is not None and save.exists():
+            raise OutputError(
+                f"{save}: holds what was recorded before, which --resume would replace: name "
+                f"another file with --live-save; torchcss view {self.out} --save FILE.rrd records "
+                "all frames"
+            )
         if self.live or connect is not None or save is not None:
             from torchcss.app.live import LiveViewer
 

@@ -57,7 +57,7 @@ class ViewFiles:
     def fingerprints(self) -> dict[str, str]:
         """What tells each of its files from others, wherever it lies."""
         paths = {name: getattr(self, name) for name in _PATHS}
-        return {name: _fingerprint(path) for name, path in paths.items() if path is not None}
+        return {name: fingerprint(path) for name, path in paths.items() if path is not None}
 
     def moved(self, given: ViewFiles, fingerprints: Mapping[str, str]) -> ViewFiles:
         """The same files where they are now.
@@ -74,7 +74,7 @@ class ViewFiles:
             path, known = getattr(given, name), getattr(self, name)
             if None in (path, known) or path.resolve() == known.resolve():
                 continue
-            if name not in fingerprints or _fingerprint(path) != fingerprints[name]:
+            if name not in fingerprints or fingerprint(path) != fingerprints[name]:
                 raise ConfigurationError(
                     f"the run was begun with the {name} {known}, now {path} is another one; give "
                     "the same, choose another folder with --out, or leave --resume out to start "
@@ -88,10 +88,14 @@ _MOST_READ = 2**25
 """Bytes of a file, or of all files of a folder, that tell it from others."""
 
 
-def _fingerprint(path: Path) -> str:
-    """A hash of a file's size, beginning and end; of a folder's files with their names."""
+def fingerprint(path: Path) -> str:
+    """A hash of a file's size, beginning and end; of a folder's files with their names.
+
+    Args:
+        path: The file or folder, or FILE#SELECTION; one that is not there has a hash of its own.
+    """
     archive, _, selection = str(path).rpartition("#")
-    if not path.exists():
+    if archive and not path.exists():
         path = Path(archive)
     found = hashlib.sha256((selection if str(path) == archive else "").encode())
     with suppress(OSError):  # whoever reads it says so
