@@ -71,6 +71,27 @@ def test_the_verb_for_a_run_that_is_there(folder: Path) -> None:
     assert "say where with" in page  # the overlay is the track's, the video is gone
 
 
+def test_a_run_that_went_on_and_was_interrupted_has_its_page(folder: Path, tmp_path: Path) -> None:
+    """The film that was drawn before ends before the track, and the summary is of then."""
+    overlay = folder / "overlay.mp4"
+    overlay.unlink()
+    grey_film(overlay, (40, 120), (800, 600))
+    write_summary(folder, {"ended": "complete", "num_frames": 2})
+    run = Run.open(folder)
+    page = unescape(report.write_report_page(run).read_text())
+    assert "It ends before the track" in page
+    assert "overlay.mp4: 1 frames of the track are missing" in page
+    assert "complete; summary.json is of another moment of the run, when there were 2" in page
+    assert "data:video/mp4" in page
+    # Where the video is, the rest is drawn over it.
+    (camera,) = run.cameras
+    grey_film(tmp_path / "video.mp4", (10,) * 3, (800, 600))
+    files = replace(camera.files, video=tmp_path / "video.mp4")
+    run = replace(run, track=run.track._replace(cameras=(camera._replace(files=files),)))
+    page = unescape(report.write_report_page(run).read_text())
+    assert "It ends before the track" not in page
+
+
 def test_a_page_of_a_folder_that_is_moved(folder: Path, tmp_path: Path) -> None:
     place = tmp_path / "an <other> 'place'"
     page = report.write_report_page(Run.open(folder)).name

@@ -21,9 +21,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from torchcss.errors import VideoError
 from torchcss.files import write_text
 from torchcss.io.run import Run
-from torchcss.io.tracks import TRACK_NAME
+from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
 from torchcss.show.track_pictures import has_pictures, pictures_of
@@ -149,21 +150,28 @@ def _film(run: Run, *, anew: bool) -> str:
     rows = range(0, count, math.ceil(count / MOST_PICTURES))
     times = run.track.times[rows]
     rate = (len(rows) - 1) / float(times[-1] - times[0]) if len(rows) > 1 else 1.0
-    still = BytesIO()
+    still, missing = BytesIO(), ""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         with VideoWriter(path, rate, crf=_CRF) as film:
-            for row, image in pictures_of(run, rows, anew=anew):
-                picture = Image.fromarray(image)
-                picture.thumbnail((LONGER_SIDE, LONGER_SIDE))
-                film.write(np.asarray(picture))
-                if row == rows[0]:
-                    picture.save(still, "JPEG")
+            try:
+                for _, image in pictures_of(run, rows, anew=anew):
+                    picture = Image.fromarray(image)
+                    picture.thumbnail((LONGER_SIDE, LONGER_SIDE))
+                    film.write(np.asarray(picture))
+                    if not still.tell():
+                        picture.save(still, "JPEG")
+            except VideoError as error:
+                # A film that ends before a track that went on is worth showing.
+                if anew or not still.tell():
+                    raise
+                missing = f"<p>It ends before the track: {escape(str(error))} (--video).</p>"
         data = _data("video/mp4", path.read_bytes())
     return (
         f'<video controls loop muted playsinline poster="{_data("image/jpeg", still.getvalue())}" '
         f'src="{data}"></video>'
         "<p>Filled: the best mode. Outlines: the other modes, fainter the less they weigh.</p>"
+        + missing
     )
 
 
@@ -198,7 +206,8 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         ("Video", str(files.video) if files else "not known"),
         (
             "Frames",
-            f"{len(track.frames)} ({span}), {summary.get('ended', 'not known whether all')}",
+            f"{len(track.frames)} ({span}), {summary.get('ended', 'not known whether all')}"
+            + _disagreement(run),
         ),
         ("Told lost", _losses(run)),
         ("Body", f"{settings.get('body', run.body.name)}, {track.state.shape[2]} parameters"),
@@ -218,6 +227,14 @@ def _facts(run: Run) -> list[tuple[str, str]]:
         facts.append(("Stature", told))
         facts.append(("Followed", f"--person {files.person}" if files else "not known"))
     return facts
+
+
+def _disagreement(run: Run) -> str:
+    """What to say where the summary is of more or fewer frames than the track."""
+    told = run.summary.get("num_frames", len(run.track.frames))
+    if told == len(run.track.frames):
+        return ""
+    return f"; {SUMMARY_NAME} is of another moment of the run, when there were {told}"
 
 
 def _row(run: Run) -> Preset | None:

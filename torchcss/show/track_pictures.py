@@ -2,7 +2,7 @@
 
 `write_overlays` makes `overlay.mp4`, and one for every further camera. `pictures_of` yields the
 picture of every frame: from the video, with the modes drawn anew, or else from the `overlay.mp4`
-that the tracker left.
+that the tracker left. One that went on is drawn from the video where that film ends.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def known_video(run: Run) -> Path | None:
 
 
 def overlay_of(run: Run) -> Path | None:
-    """The film that the tracker drew of these very modes, if it is there."""
+    """The film that the tracker drew of these very modes, or of the first ones, if it is there."""
     overlay = run.folder / OVERLAY_NAME
     # What the tracker drew is not what, say, a smoothed track says.
     return overlay if run.path.name == TRACK_NAME and overlay.is_file() else None
@@ -106,25 +106,24 @@ def pictures_of(
         CameraError: If the camera is of another image size.
         TrackFileError: If the body or the camera is not known.
     """
-    overlay, video, rows = overlay_of(run), known_video(run), list(rows)
-    if overlay is not None and (video is None or not anew):
-        missing, shown = len(rows), overlay
-        for frame in VideoReader(overlay, stop=max(rows, default=0) + 1):
-            if frame.index in rows:
-                missing -= 1
-                yield frame.index, frame.image
-    elif video is not None:
-        first, missing, shown = run.cameras[0], 0, video
-        for row, image in _frames_of(run, first, rows):
-            if image is None:
-                missing += 1
-            else:
-                yield row, draw_modes(image, run.body, run.track.modes(row), first.camera)
-    else:
+    overlay, video, left = overlay_of(run), known_video(run), list(rows)
+    if not left or (overlay is None and video is None):
         return
-    if missing:
+    if overlay is not None and (video is None or not anew):
+        for frame in VideoReader(overlay, stop=left[-1] + 1):
+            if frame.index in left:
+                left.remove(frame.index)
+                yield frame.index, frame.image
+    if left and video is not None:
+        first = run.cameras[0]
+        for row, image in _frames_of(run, first, tuple(left)):
+            if image is not None:
+                left.remove(row)
+                yield row, draw_modes(image, run.body, run.track.modes(row), first.camera)
+    if left:
         raise VideoError(
-            f"{shown}: {missing} frames of the track are missing; give the video that was tracked"
+            f"{video or overlay}: {len(left)} frames of the track are missing; give the video that "
+            "was tracked"
         )
 
 
