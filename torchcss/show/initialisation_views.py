@@ -61,7 +61,7 @@ def draw_hypotheses(
             text = "" if cost is None else f"{mode + 1}: {float(cost[mode]):.1f}"
             look = {"color": mode_colour(mode), "lw": 3 if mode == 0 else 1.5}
             draw_bones(axes, places[mode], bones, look, label=text)
-        label(axes, title, "metres")
+        label(axes, title, "metres", "metres up")
         axes.set(aspect="equal", xlim=(-extent, extent), ylim=(-extent, extent))
     if cost is not None:
         handles, labels = figure.axes[0].get_legend_handles_labels()
