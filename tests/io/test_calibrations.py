@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.io import savemat
 
 from torchcss.body.rotations import about
 from torchcss.errors import CameraError
@@ -163,7 +164,6 @@ def test_arrays_take_the_size_of_the_video(tmp_path: Path, shape: tuple[int, ...
 
 @pytest.mark.parametrize("form", ["new", "old", "intrinsics"])
 def test_matlab(tmp_path: Path, form: str) -> None:
-    scipy_io = pytest.importorskip("scipy.io")
     one_based = np.array(K) + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
     values = {
         "ImageSize": [480, 640], "RadialDistortion": [0.11, -0.24, 0.07],
@@ -175,7 +175,7 @@ def test_matlab(tmp_path: Path, form: str) -> None:
         }[form],
     }  # fmt: skip
     content = {"new": {"cameraParams": values}, "old": values, "intrinsics": {form: values}}[form]
-    scipy_io.savemat(tmp_path / "a.mat", content)
+    savemat(tmp_path / "a.mat", content)
     check(tmp_path / "a.mat")
     plain = {key: np.asarray(each).tolist() for key, each in values.items()}
     (tmp_path / "a.json").write_text(json.dumps(plain))
@@ -183,9 +183,8 @@ def test_matlab(tmp_path: Path, form: str) -> None:
 
 
 def test_bouguets_toolbox(tmp_path: Path) -> None:
-    scipy_io = pytest.importorskip("scipy.io")
     values = {"fc": [[FX], [FY]], "cc": [[CX], [CY]], "kc": np.array(LENS)[:, None], "nx": 640}
-    scipy_io.savemat(tmp_path / "Calib_Results.mat", {**values, "ny": 480})
+    savemat(tmp_path / "Calib_Results.mat", {**values, "ny": 480})
     check(tmp_path / "Calib_Results.mat")
 
 
@@ -324,8 +323,6 @@ def test_easymocap_names_stay_text(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_bad_files(tmp_path: Path, name: str, text: str, words: str) -> None:
-    if name.endswith(".mat"):
-        pytest.importorskip("scipy.io")
     (tmp_path / name).write_text(text)
     with pytest.raises(CameraError, match=words) as caught:
         load_camera(tmp_path / name)
@@ -913,12 +910,11 @@ def test_colmaps_folders_and_matrices_in_other_files(tmp_path: Path) -> None:
 
 
 def test_pair_of_matlabs(tmp_path: Path) -> None:
-    matlab = pytest.importorskip("scipy.io")
     camera = {"K": np.add(K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]]), "ImageSize": [480, 640],
               "RadialDistortion": [LENS[0], LENS[1], LENS[4]],
               "TangentialDistortion": LENS[2:4]}  # fmt: skip
     pair = {"CameraParameters1": camera, "CameraParameters2": camera}
-    matlab.savemat(tmp_path / "a.mat", {"errors": {"mean": 0.3}, "stereoParams": pair})
+    savemat(tmp_path / "a.mat", {"errors": {"mean": 0.3}, "stereoParams": pair})
     check(tmp_path / "a.mat", name="2")
 
 

@@ -12,7 +12,7 @@
 | COLMAP | `cameras.txt` or `cameras.bin`, or their folder; `images` beside say places |
 | KITTI, ROS | `.txt`: numbers below or behind what they are |
 | Qualisys, Vicon | `.qca.txt`, `.xcp` |
-| MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc` (SciPy); JSON |
+| MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc`; JSON |
 | arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone; of several cameras |
 
 Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
@@ -41,7 +41,7 @@ import yaml
 
 from torchcss.body.files.xml import parse_xml
 from torchcss.body.rotations import from_quaternion
-from torchcss.errors import CameraError, optional_package
+from torchcss.errors import CameraError
 from torchcss.files import (
     load_array,
     load_arrays,
@@ -202,7 +202,6 @@ def read_entries(path: Path) -> dict[str, Entry]:
 
     Raises:
         CameraError: If the file is missing, damaged or none of the formats.
-        MissingExtraError: If SciPy is needed and not installed.
     """
     if path.is_dir():
         return _read_folder(path)
@@ -821,14 +820,15 @@ def _read_easymocap(path: Path) -> dict[str, Entry]:
 
 def _read_matlab(path: Path) -> dict[str, Entry]:
     """MATLAB's camera parameters; its pixels count from 1, and old matrices are transposed."""
+    from scipy.io import loadmat  # takes a second to import
+
     data = read_bytes(path, CameraError, 128)
     if b"HDF" in data[:16] or data.startswith(b"MATLAB 7.3"):
         raise CameraError(f"{path}: of version 7.3; save it with save('-v7')")
-    scipy_io = optional_package("scipy.io", f"{path}: a .mat is read by SciPy; pip install scipy")
     _check_matlab_size(path)
     # SciPy raises whatever the damage leads to.
     with refusing(CameraError, f"{path}: cannot be read as MATLAB's"):
-        content = scipy_io.loadmat(path, simplify_cells=True)
+        content = loadmat(path, simplify_cells=True)
     values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
     for each in [each for each in values.values() if isinstance(each, dict)]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
