@@ -88,7 +88,8 @@ def test_numbers_in_other_units_are_told(tmp_path: Path) -> None:
     assert "a.urdf: joints whose limits are far apart, ['a']: they" in load_body(path).notes[1]
     path.write_text(path.read_text().replace('xyz="0 0 0.3"', 'xyz="0 0 300"'))
     assert load_body(path).notes[2] == (
-        "a.urdf: it reaches 600 m: a file in millimetres takes scale=0.001"
+        "a.urdf: it reaches 600 m, as its lengths count as metres: write those of a file in "
+        "millimetres as metres, or load it in Python by load_body(..., scale=0.001)"
     )
 
 

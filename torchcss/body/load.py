@@ -186,7 +186,10 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
     notes, poses = skeleton.notes, rest_poses(joints)
     reach = max(float(np.linalg.norm(poses[link][:3, 3])) for link in skeleton.places)
     if reach > _LARGEST:
-        notes += (f"it reaches {reach:.0f} m: a file in millimetres takes scale=0.001",)
+        notes += (
+            f"it reaches {reach:.0f} m, as its lengths count as metres: write those of a file in "
+            "millimetres as metres, or load it in Python by load_body(..., scale=0.001)",
+        )
     markers = [
         MarkerSpecification(name=landmarks.get(link, link), link=link) for link in skeleton.places
     ]
