@@ -113,6 +113,11 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
         (("--body", "octopus"), "octopus"),
         (("--click",), "no window can be opened"),
         (("--coarse-pose", "nowhere.json"), "nowhere.json"),
+        (
+            ("--initialisation", "papers", "--hypotheses", "3", "--colours=True"),
+            "--hypotheses, --colours: not with --initialisation papers",
+        ),
+        (("--initialisation", "papers", "--proportions", "all"), "--proportions: not with"),
     ],
 )
 def test_one_clear_line(scene: Path, tmp_path: Path, options: tuple, message: str, capsys):
@@ -126,7 +131,8 @@ def test_the_papers_stages_from_a_coarse_pose(scene: Path, tmp_path: Path, capsy
     camera = ("--camera", str(scene / "cameras.json"))
     pose = tmp_path / "pose.json"
     pose.write_text(json.dumps({"r_elbow_flexion": 0.5}))
-    papers = ("--initialisation", "papers", "--coarse-pose", str(pose), *camera)
+    same = ("--hypotheses", "best", "--no-colours", "--proportions", "papers")
+    papers = ("--initialisation", "papers", "--coarse-pose", str(pose), *camera, *same)
     assert init(scene, tmp_path / "out", *papers) == 0
     assert "1 hypotheses" in capsys.readouterr().out
     for text, message in (("[1]", "numbers by parameter"), ('{"tail": 1}', "tail"),

@@ -147,6 +147,29 @@ def test_interrupt_has_its_own_status(files: Path, monkeypatch: pytest.MonkeyPat
     assert track(files) == 130
 
 
+@pytest.mark.parametrize(
+    ("verb", "told"),
+    [
+        (cli.Track, "; the frames tracked so far are on disk, and --resume goes on with them"),
+        (cli.Batch, "; what was tracked so far is on disk, and the same command goes on with it"),
+        (cli.Export, ""),
+        (cli.Plot, ""),
+        (cli.Detect, ""),
+        (cli.Undistort, ""),
+    ],
+)
+def test_an_interruption_tells_what_is_left(
+    verb: type, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(_verb: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(verb, "run", interrupted)
+    more = {cli.Export: ["--to", "bvh"], cli.Undistort: ["--camera", "b"]}.get(verb, [])
+    assert cli.main([verb.__name__.lower(), "a", *more]) == 130
+    assert capsys.readouterr().err == f"torchcss: interrupted{told}\n"
+
+
 @pytest.mark.parametrize("verb", ["demo", "track"])
 def test_help(verb: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:

@@ -40,19 +40,19 @@ class Init:
     ground: float | None = InitialiseOptions.ground
     """Height of the floor that the person stands on, along the world's axis that points up, metres;
     it tells the size. In a camera's own frame: how far it is above the floor, with a minus."""
-    proportions: Literal["all", "papers"] = "all"
-    """All lengths, or the papers' eight (places of hips, clavicles and skull tip) beside those of
-    trunk and limbs."""
+    proportions: Literal["all", "papers"] | None = None
+    """All lengths (by default), or the papers' eight (places of hips, clavicles and skull tip)
+    beside those of trunk and limbs."""
     initialisation: Literal["ours", "papers"] = "ours"
     """From many starts, or the papers' three stages: one fit from a coarse pose, no colours."""
     coarse_pose: Path | None = None
     """JSON file of a pose to start from: radians by parameter of the body."""
-    hypotheses: Literal["best", "all"] | int = InitialiseOptions.num_modes or "all"
-    """How many hypotheses to keep: best, all, or a number."""
+    hypotheses: Literal["best", "all"] | int | None = None
+    """How many hypotheses to keep: best, all, or a number; by default 8."""
     contours: bool = InitialiseOptions.contours
     """Fit cross-sections and tapers to the picture's contours too."""
-    colours: bool = InitialiseOptions.colours
-    """Let these fits see the colours on either side of the outline too."""
+    colours: bool | None = None
+    """Let these fits see the colours on either side of the outline too, as by default."""
     sigma: float | None = InitialiseOptions.sigma
     """Noise of a marked wrist or a robot's joint, pixels; by default 0.6 % of the body's size."""
     seed: int = Settings.seed
@@ -68,6 +68,8 @@ class Init:
     def run(self) -> None:
         """Run the verb."""
         files, keypoints = self.files, None
+        if self.initialisation == "papers":
+            self._check_papers()
         if self.click == (files.joints is not None):
             raise KeypointError("give a file with --joints, or --click to mark the joints")
         if self.click:
@@ -80,13 +82,14 @@ class Init:
             size = (picture.shape[1], picture.shape[0])
             write_clicked(self.out / "joints.json", keypoints, size, frame=files.frame)
         proportions = PAPER_LENGTHS if self.proportions == "papers" else PROPORTIONS
+        kept = InitialiseOptions.num_modes if self.hypotheses is None else self.hypotheses
         options = InitialiseOptions(
             sigma=self.sigma,
             stature=self.stature,
             ground=self.ground,
-            num_modes={"best": 1, "all": None}.get(str(self.hypotheses), self.hypotheses),  # type: ignore[arg-type]
+            num_modes={"best": 1, "all": None}.get(str(kept), kept),  # type: ignore[arg-type]
             contours=self.contours,
-            colours=self.colours,
+            colours=InitialiseOptions.colours if self.colours is None else self.colours,
             search=StartSearch(proportions=proportions, coarse_pose=_coarse_pose(self.coarse_pose)),
             dtype=torch.float32 if self.dtype == "float32" else torch.float64,
             device=self.device,
@@ -113,6 +116,16 @@ class Init:
                 f"{row['difference_percent']:+11.1f} %"
             )
         print(f"{len(found.cost)} hypotheses in {summary['seconds']:.1f} s; look at {self.out}")
+
+    def _check_papers(self) -> None:
+        """Refuse what the papers' stages have otherwise."""
+        theirs = {"hypotheses": "best", "colours": False, "proportions": "papers"}
+        given = {name: getattr(self, name) for name in theirs}
+        if other := [f"--{n}" for n, value in given.items() if value not in (None, theirs[n])]:
+            raise ConfigurationError(
+                f"{', '.join(other)}: not with --initialisation papers, which keeps the best of "
+                "one fit, without colours, of the papers' proportions; leave it out"
+            )
 
 
 def _coarse_pose(path: Path | None) -> dict[str, float]:

@@ -73,12 +73,20 @@ a detector of people; `torchcss track --help` tells what else it takes.
 Bad input ends with one line on standard error and exit status 2. What was tracked before an
 interruption is on disk: `torchcss track ... --resume` goes on."""
 
+_LEFT = {
+    Demo: "; the frames tracked so far are on disk",
+    Track: "; the frames tracked so far are on disk, and --resume goes on with them",
+    Batch: "; what was tracked so far is on disk, and the same command goes on with it",
+}
+"""What an interruption leaves of the verbs that track."""
+
 _OLD_NAMES = {
     "--evidence": "--likelihood-power",
     "--focal-px": "--focal",
     "--field-of-view": "--fov",
     "--agility": "--acceleration-ratio",
     "--no-recovery": "--recovery=False",
+    "--no-colours": "--colours=False",
 }
 """Options of version 0.1 that are written otherwise now; not in the help."""
 
@@ -95,6 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     options = [word.partition("=") for word in words]
     words = ["".join((_OLD_NAMES.get(name, name), *value)) for name, *value in options]
+    verb = None
     try:
         # Settings check themselves, so that reading them may fail as well.
         verb = tyro.cli(Verb, prog="torchcss", args=words, description=_DESCRIPTION)  # type: ignore[arg-type]
@@ -107,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"torchcss: {OutputError(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interruption:
-        print("torchcss: interrupted; the frames tracked so far are on disk", file=sys.stderr)
+        print(f"torchcss: interrupted{_LEFT.get(type(verb), '')}", file=sys.stderr)
         return 143 if isinstance(interruption, Terminated) else 130
     return 0
 
