@@ -5,7 +5,8 @@
 One reprojection problem (`torchcss.studies.reprojection`: 34 parameters, 22 joints in one image,
 sticky priors, joint limits) is descended from random starts by
 
-* `torchcss`: `TrustRegionNewton` on the closed-form cost, both compiled where numba is;
+* `torchcss`: `TrustRegionNewton` on the closed-form cost, both compiled where numba is, without
+  the covariances at the ends, which the others do not find either;
 * `torchcss, torch cost`: the same on the cost in torch;
 * `scipy trf`: `scipy.optimize.least_squares` with bounds and an analytic Jacobian;
 * `scipy L-BFGS-B`, which gets value and gradient;
@@ -134,8 +135,8 @@ def make_solver(config: Config, problem: ReprojectionProblem, name: str) -> Any:
         cost = CompiledReprojection.of(problem.cost) if compiled else problem.cost
 
         def ours(x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            modes = newton.minimise(cost, torch.from_numpy(x0), problem.bounds)
-            return modes.mean.numpy(), modes.num_steps.numpy()
+            ends = newton.descend(cost, newton.start(torch.from_numpy(x0)), problem.bounds)
+            return ends.x.numpy(), ends.num_steps.numpy()
 
         return ours
     if name in (JAX, COMPACTED):
