@@ -120,7 +120,7 @@ def check_range(
 
     Args:
         choice: A record of choices.
-        names: Its attributes: a number each, or several of which each is to lie there.
+        names: Its attributes: a number each, or a tuple of which each is to lie there.
         least: The lower end.
         most: The upper end.
         hint: What to do, for the message.
@@ -132,9 +132,9 @@ def check_range(
     span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
     for name in names:
         value = getattr(choice, name)
-        numbers = torch.as_tensor(() if value is None else value, dtype=torch.float64)
-        fits = (numbers >= least) & (numbers <= most) & (numbers.isfinite() | (not finite))
-        if not bool(fits.all()):
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        # Trackers are made anew for each frame: tensors would take far longer.
+        if not all(least <= each <= most and (each < math.inf or not finite) for each in numbers):
             where = f"{type(choice).__name__}.{name}"
             raise ConfigurationError(f"{where}: expected {span}, got {value}{hint}")
 
