@@ -262,6 +262,10 @@ def test_a_csv_and_folders(tmp_path: Path) -> None:
         ("a.csv", "video;sigma;stop\n a.mp4;2,5;20\nb.mp4;;\n;;\n"),  # of a spreadsheet
         ("a.csv", "sep=,\r\nVideo, Sigma, Stop,\r\na.mp4, 2.5, 20,\r\nb.mp4\r\n"),
         ("a.csv", "\nvideo,sigma,stop\na.mp4,2.5,20.0\nb.mp4,,\n"),  # pandas: some have none
+        (
+            "a.jsonl",
+            '{"video": "a.mp4", "sigma": 2.5, "stop": 20.0}\n{"video": "b.mp4", "stop": NaN}',
+        ),
         ("a.tsv", "video\tsigma\tstop\na.mp4\t2.5\t20\nb.mp4\t\t\n"),
         ("a.json", '[{"video": "a.mp4", "sigma": 2.5,\n "stop": 20.0},\n{"video": "b.mp4"}]'),
         ("a.jsonl", '\ufeff{"video": "a.mp4", "sigma": 2.5, "stop": 20}\r\n{"video": "b.mp4"}\r\n'),
@@ -275,14 +279,25 @@ def test_manifests_as_programs_write_them(tmp_path: Path, name: str, text: str) 
     assert (other.name, {*other.row}) == ("b", {"video"})
 
 
+def test_a_person_by_number_in_a_column_with_empty_cells(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("video,person\na.mp4,3.0\nb.mp4,\nc.mp4,v1.0x\n")
+    assert [clip.row.get("person") for clip in read_manifest(tmp_path / "a.csv")] == [
+        "3", None, "v1.0x"
+    ]  # fmt: skip
+
+
 def test_a_folder_tells_what_it_leaves_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for folder in ("pictures", "walk"):
         (tmp_path / folder).mkdir()
-    for name in ("a.MTS", "._a.MTS", "notes.txt", "walk/video.mov"):
+    for name in ("a.MTS", "._a.MTS", "notes.txt", "walk/video.mov", "walk/keypoints.npz"):
         (tmp_path / name).touch()
-    assert [clip.name for clip in read_manifest(tmp_path)] == ["a", "walk"]
+    one, other = read_manifest(tmp_path)
+    assert (one.name, other.name) == ("a", "walk")
+    assert other.row["keypoints"] == str(tmp_path / "walk" / "keypoints.npz")
+    (tmp_path / "walk" / "keypoints2d.npz").touch()
+    assert read_manifest(tmp_path)[1].row["keypoints"].endswith("keypoints2d.npz")
     assert "left out: pictures\n" in capsys.readouterr().err
 
 

@@ -82,15 +82,20 @@ SETTING_COLUMNS = names_in(
 """Columns that are settings of this clip alone."""
 
 
+def _number_of_person(text: str) -> str:
+    """As it is; in a column with empty cells many programs write 5 as 5.0."""
+    return re.sub(r"(?<=[0-9])\.0*$", "", text)
+
+
 def _whole(text: str) -> int:
-    """A whole number; in a column with empty cells many programs write 5 as 5.0."""
-    return int(re.sub(r"\.0*$", "", text))
+    return int(_number_of_person(text))
 
 
 _NUMBERS = {
     **dict.fromkeys(names_in("start stop stride seed samples modes working_size"), _whole),
     **dict.fromkeys(names_in("frame_rate sigma focal fov stature ground"), float),
 }
+_KINDS = {**_NUMBERS, "person": _number_of_person}
 _COLUMNS = ("name", "start", "stop", *FILE_COLUMNS, *OPTION_COLUMNS, *SETTING_COLUMNS)
 _SCALES = " or ".join(get_args(Scale))
 _FOLDER = re.compile(r"(?!\.|batch\.(json|html)$)[^\0-\x1f\ud800-\udfff]+")
@@ -108,7 +113,7 @@ class Batch:
 
     manifest: Annotated[Path, tyro.conf.Positional]
     """CSV or JSON with the columns video, camera, keypoints, name and options; or a folder of
-    folders that hold video.mp4, cameras.json and keypoints2d.npz, or of videos."""
+    folders that hold video.mp4, cameras.json and keypoints.npz, or of videos."""
     out: Path = Path("out/batch")
     """Folder of the results, one folder a clip."""
     workers: int = 1
@@ -283,13 +288,15 @@ def _rows_of_json(path: Path, text: str) -> dict[str, Any]:
 
 def _rows_of_folder(folder: Path) -> Iterator[dict[str, str]]:
     """Videos, and folders of a video with its files; of other folders a line is printed."""
-    usual = {"camera": "cameras.json", "keypoints": "keypoints2d.npz"}
+    usual = (
+        ("camera", "cameras.json"), ("keypoints", "keypoints.npz"), ("keypoints", "keypoints2d.npz")
+    )  # fmt: skip
     others: list[str] = []
     # What begins with a dot is the system's.
     for inner in sorted(each for each in folder.iterdir() if not each.name.startswith(".")):
         if inner.is_dir():
             videos = [each for s in VIDEO_SUFFIXES if (each := inner / f"video{s}").is_file()]
-            beside = {c: str(inner / n) for c, n in usual.items() if (inner / n).is_file()}
+            beside = {c: str(inner / n) for c, n in usual if (inner / n).is_file()}
             if videos:
                 yield {"name": inner.name, "video": str(videos[0]), **beside}
             else:
@@ -313,12 +320,12 @@ def _clip(row: object, where: str, folder: Path) -> Clip:
     for name, value in row.items():
         if value in (None, "") or value != value:  # NaN is how pandas writes an empty cell
             continue
-        kind = _NUMBERS.get(name, str)
+        kind = _KINDS.get(name, str)
         with suppress(ValueError):
             if isinstance(value, str | int | float) and not isinstance(value, bool):
                 given[name] = kind(str(value))
         if name not in given:
-            what = {_whole: "a whole number", float: "a number", str: "a text"}[kind]
+            what = {_whole: "a whole number", float: "a number"}.get(kind, "a text")
             raise unexpected(ConfigurationError, f"{where}: {name}", what, value)
         if name == "normalised" and given[name] not in get_args(Scale):
             raise unexpected(ConfigurationError, f"{where}: {name}", _SCALES, value)

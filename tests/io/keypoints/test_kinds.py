@@ -1853,6 +1853,14 @@ def test_frames_of_skeletons(tmp_path: Path) -> None:
     check(read(write(tmp_path / "a.json", {"data": frames, "label": "walk", "label_index": 3})))
 
 
+def test_pictures_with_gaps_ask_for_their_folder(tmp_path: Path) -> None:
+    entries = [{"image_id": f"img_{5 * t:04d}.png", "keypoints": flat(t)} for t in T]
+    path = write(tmp_path / "a.json", entries)
+    with pytest.raises(KeypointError, match=r"found 26; .* or give the folder of the pictures"):
+        read(path)
+    check(read(path, frame_names=[f"img_{5 * t:04d}.jpg" for t in T]))
+
+
 def test_yolo_labels_of_all_frames_in_one_file(tmp_path: Path) -> None:
     """What its tracker leaves when it gets frame after frame: no picture of so many people."""
     rows = [

@@ -70,7 +70,8 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
         )
     total = max(max(found, default=-1) + 1, film.num_frames or 0)
     if film.num_frames is not None and total > film.num_frames:
-        raise wrong_count(film.num_frames, total)
+        named = film.names is None and any(isinstance(key, str) for key in frames)
+        raise wrong_count(film.num_frames, total, named=named)
     if total > FRAMES_AT_MOST:
         raise KeypointError(f"{total - 1} is not a frame number; number the frames from 0")
     if len(found) < total:
@@ -78,9 +79,10 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
     return [found.get(index, []) for index in range(total)]
 
 
-def wrong_count(expected: int, found: int) -> KeypointError:
-    """The error for a file that has other frames than the video."""
+def wrong_count(expected: int, found: int, *, named: bool = False) -> KeypointError:
+    """The error for a file that has other frames than the video, maybe by pictures' names."""
     cut_off = ", or get a complete copy of it if it is cut off" if found > expected else ""
+    cut_off += ", or give the folder of the pictures as the video" if named else ""
     return KeypointError(
         f"expected {expected} frames, as the video has, found {found}; "
         f"make the keypoints from this very video{cut_off}"

@@ -357,6 +357,9 @@ def _checked_numbers(
         report.append(f"confidences run to {most:g}: they are taken for percent")
         frames = [frame * (1.0, 1.0, 0.01) for frame in frames]
     for index, frame in enumerate(frames):
+        if not len(frame):  # most of them, of a file of few pictures
+            checked.append(frame)
+            continue
         # All three not a number is how some programs write a joint that they did not find.
         frame = np.where(np.isnan(frame).all(-1, keepdims=True), 0.0, frame)
         confidence, finite = frame[..., 2], np.isfinite(frame[..., :2]).all(-1)
