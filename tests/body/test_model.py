@@ -12,7 +12,7 @@ import torch
 from reference.kinematics import rotation
 from torch import Tensor
 
-from torchcss.body.catalog import BODY_NAMES, LENGTHS, PLACES, specification
+from torchcss.body.catalog import BODY_NAMES, LENGTH_RATE, LENGTHS, PLACES, specification
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
@@ -46,6 +46,14 @@ def test_layout(name: str) -> None:
         assert body.joint_index(joint) == index
     for index, parameter in enumerate(body.state_names):
         assert body.state_index(parameter) == index
+
+
+def test_lengths_hardly_move() -> None:
+    body = load_body("body34", free_proportions=(*LENGTHS, *PLACES))
+    rates = dict(zip(body.state_names, body.motion_rate.tolist(), strict=True))
+    lengths = {f"{name}_length" for name in (*LENGTHS, *PLACES)} & rates.keys()  # not the foot
+    assert {rates[name] for name in lengths} == {LENGTH_RATE}
+    assert min(rates[name] for name in rates.keys() - lengths) > 0.1
 
 
 def test_unknown_names_are_refused() -> None:

@@ -58,6 +58,9 @@ ARM_NAMES = tuple(name for name in BODY_NAMES if name.startswith("arm"))
 HABITS: dict[str, tuple[float, float, float]] = _TABLE["habits"]
 """Of every angle: rest value and deviation, degrees; deviation of its speed, radians per second."""
 
+LENGTH_RATE = 0.01
+"""Speed of lengths and places: they stay as they are, and are learnt by a centimetre a second."""
+
 DEFAULT_RATE = 2.0
 """Speed assumed for any other parameter, such as a robot's joint."""
 
@@ -66,6 +69,8 @@ _DEGREE = math.pi / 180
 
 def motion_rate(parameter: str) -> float:
     """Deviation of the speed of a parameter, metres or radians per second."""
+    if parameter.removesuffix("_length") in {*LENGTHS, *PLACES}:
+        return LENGTH_RATE
     habit = HABITS.get(without_side(parameter))
     return _TABLE["root_speeds"].get(parameter, DEFAULT_RATE) if habit is None else habit[2]
 
