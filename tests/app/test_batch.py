@@ -48,6 +48,8 @@ def test_a_bad_clip_fails_alone_and_is_tried_again_when_it_has_changed(tmp_path:
     told = json.loads((tmp_path / "out" / "batch.json").read_text())
     assert (told["done"], told["failed"]) == (1, 1)
     assert "bad.mp4" in told["clips"]["bad"]["about"]
+    page = (tmp_path / "out" / "batch.html").read_text()
+    assert re.findall("href='([^']*)'", page) == ["good/"]  # of the other there is no folder
     assert Run.open(tmp_path / "out" / "good").settings["seed"] == 3
     failed = tmp_path / "out" / ".batch" / "failed" / "bad.json"
     before = failed.stat().st_mtime_ns

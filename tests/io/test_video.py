@@ -626,6 +626,18 @@ def test_pictures_of_several_kinds_are_told() -> None:
     assert "1 .jpg and 2 .png" in told
 
 
+def test_pictures_that_are_not_read_are_told(tmp_path: Path) -> None:
+    (tmp_path / "2.HEIC").touch()
+    with pytest.raises(VideoError, match=r"no images in this folder; .* 1, such as 2\.HEIC: save"):
+        VideoReader(tmp_path)
+    for name in ("1.jpg", "3.jpg"):
+        Image.new("RGB", (8, 6)).save(tmp_path / name)
+    view = open_view(ViewFiles(video=tmp_path, keypoints=None), Camera.pinhole(8, 6, focal_px=6.0))
+    assert any("not read are left out, 1, such as 2.HEIC" in note for note in view.notes)
+    (tmp_path / "2.HEIC").unlink()
+    assert VideoReader(tmp_path).left_out is None
+
+
 def test_natural_order() -> None:
     names = ["10.png", "2.PNG", "a10", "a2", "b", "²", "1"]  # a superscript is no digit
     assert sorted(names, key=natural_order) == ["1", "2.PNG", "10.png", "a2", "a10", "b", "²"]

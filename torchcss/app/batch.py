@@ -459,11 +459,13 @@ class Job(NamedTuple):
         counts = {kind: kinds.count(kind) for kind in ("done", "failed", "tracking", "waiting")}
         plain = {name: state._asdict() for name, state in states.items()}
         write_text(self.out / "batch.json", json.dumps({**counts, "clips": plain}, indent=1))
-        rows = "".join(
-            f"<tr><td><a href='{quote(name)}/'>{html.escape(name)}</a></td>"
-            f"<td>{state.kind}</td><td>{html.escape(state.about)}</td></tr>\n"
-            for name, state in states.items()
-        )
+        rows = ""
+        for name, state in states.items():
+            called = html.escape(name)
+            if state.kind == "done":  # of others there is no folder
+                called = f"<a href='{quote(name)}/'>{called}</a>"
+            about = html.escape(state.about)
+            rows += f"<tr><td>{called}</td><td>{state.kind}</td><td>{about}</td></tr>\n"
         head = "<!doctype html><meta charset='utf-8'><title>batch</title>"
         style = "<style>body{font:15px sans-serif}td{padding:2px 12px}</style>"
         write_text(self.out / "batch.html", f"{head}{style}<table>\n{rows}</table>\n")

@@ -70,7 +70,7 @@ class OpenView(NamedTuple):
         if self.reader.image_names is not None:
             given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
             notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
-            notes += [several_kinds(self.reader.image_names)]
+            notes += [several_kinds(self.reader.image_names), self.reader.left_out]
             notes += [missing_numbers(self.reader.image_names)]
         elif self.files.frame_rate is not None:
             rate = float(self.reader.info.frame_rate)

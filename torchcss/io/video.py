@@ -47,6 +47,9 @@ if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or wr
 IMAGE_SUFFIXES = names_in(".jpg .jpeg .png .bmp .tif .tiff .webp .pgm .ppm")
 """What counts as a frame in a folder of images."""
 
+_UNREAD = names_in(".heic .heif .avif .jxl .jp2 .gif .exr .tga .dng .cr2 .cr3 .nef .arw")
+"""Pictures of other kinds."""
+
 VIDEO_SUFFIXES = names_in(".mp4 .mov .avi .mkv .webm .m4v .mpg .mpeg .wmv .mts .m2ts .3gp")
 """What counts as a video in a folder of clips; others are read too."""
 
@@ -109,6 +112,7 @@ class VideoReader:
     Attributes:
         info: Frame rate and size, as the file states them.
         pixel_aspect: Width of a pixel against its height.
+        left_out: A line about pictures of a folder that are of kinds that are not read, if any are.
 
     Raises:
         VideoError: If nothing can be read, no frame is selected, or the stride is not positive.
@@ -116,6 +120,7 @@ class VideoReader:
 
     info: VideoInfo
     pixel_aspect = Fraction(1)
+    left_out: str | None = None
 
     def __init__(
         self,
@@ -363,9 +368,16 @@ class VideoReader:
                 # where leaving it out would shift all frames after it.
                 images = [each for each in entries if each.suffix.lower() in IMAGE_SUFFIXES]
                 films = [each for each in entries if each.suffix.lower() in VIDEO_SUFFIXES]
+                if unread := [each for each in entries if each.suffix.lower() in _UNREAD]:
+                    self.left_out = (
+                        f"pictures of kinds that are not read are left out, {len(unread)}, such as "
+                        f"{min(unread).name}: save them as PNG or JPEG"
+                    )
                 if not images:
                     expected = f"expected files that end in {', '.join(IMAGE_SUFFIXES)}"
-                    if films:
+                    if unread:
+                        expected = self.left_out
+                    elif films:
                         expected = f"give a video in it, such as {min(films)}"
                     raise VideoError(f"no images in this folder; {expected}")
                 return sorted(images, key=lambda entry: natural_order(entry.name))
