@@ -134,6 +134,7 @@ def test_names_of_the_real_file(shared_data) -> None:
          ("l_hip", "l_knee", "l_ankle", None, "l_shoulder")),
         (("upperarmleft", "lowerarmleft", "handleft", "thighright", "calfright", "footright"),
          ("l_shoulder", "l_elbow", "l_wrist", "r_hip", "r_knee", "r_ankle")),
+        (("lf_hip", "lf_knee", "rt_hip", "rt_ankle"), ("l_hip", "l_knee", "r_hip", "r_ankle")),
         (("Lft_Hip", "Rgt_Knee", "Rgt_Shoulder"), ("l_hip", "r_knee", "r_shoulder")),
         (("femur_l", "tibia_l", "talus_l", "humerus_r", "radius_r", "hand_r"),
          ("l_hip", "l_knee", "l_ankle", "r_shoulder", "r_elbow", "r_wrist")),

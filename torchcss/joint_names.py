@@ -359,13 +359,15 @@ def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
     known.update(
         word for table in (LIMB_WORDS, _ACCLAIM, _ENDS) for ws in table.values() for word in ws
     )
+    # Changes of case and digits part words; what stands before a colon is a namespace.
+    spaced = (re.sub(CASE, " ", name.split(":")[-1]).lower() for name in names)
+    parted = [[word for word in re.split(r"[^a-z]+", text) if word] for text in spaced]
+    # Beside `rt` that is the left side; else OptiTrack's LFArm is a forearm.
+    known_sides = {**_SIDES, "lf": "l_"} if any("rt" in words for words in parted) else _SIDES
     split: list[tuple[str, list[str]]] = []
-    for name in names:
-        # Changes of case and digits part words; what stands before a colon is a namespace.
-        spaced = re.sub(CASE, " ", name.split(":")[-1])
-        words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word]
-        sides = [index for index, word in enumerate(words) if word in _SIDES]
-        split.append((_SIDES[words.pop(sides[0])] if len(sides) == 1 else "", words))
+    for words in parted:
+        sides = [index for index, word in enumerate(words) if word in known_sides]
+        split.append((known_sides[words.pop(sides[0])] if len(sides) == 1 else "", words))
     every = [word for _, words in split for word in set(words)]
     common = {word for word in every if 2 * every.count(word) >= len(names)} | {"def"}
     result: list[tuple[str, str]] = []
