@@ -638,6 +638,19 @@ def test_pictures_that_are_not_read_are_told(tmp_path: Path) -> None:
     assert VideoReader(tmp_path).left_out is None
 
 
+def test_several_films_in_one_file_are_told(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        streams = [container.add_stream("libx264", rate=25) for _ in range(2)]
+        for stream, width in zip(streams, (32, 64), strict=True):
+            stream.width, stream.height, stream.pix_fmt = width, 48, "yuv420p"
+        for stream in streams:
+            image = np.zeros((48, stream.width, 3), np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+            container.mux(stream.encode(None))
+    told = "2 films or covers in one file: the first, of 32 x 48 pixels, is read"
+    assert VideoReader(tmp_path / "a.mp4").left_out == told
+
+
 def test_natural_order() -> None:
     names = ["10.png", "2.PNG", "a10", "a2", "b", "²", "1"]  # a superscript is no digit
     assert sorted(names, key=natural_order) == ["1", "2.PNG", "10.png", "a2", "a10", "b", "²"]

@@ -66,11 +66,11 @@ class OpenView(NamedTuple):
     def notes(self) -> list[str]:
         """What the files' readers have to say, for the user."""
         notes = [self.camera.units_note, *camera_findings(self.camera.camera)]
-        notes += [self.reader.varying_rate()]
+        notes += [self.reader.varying_rate(), self.reader.left_out]
         if self.reader.image_names is not None:
             given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
             notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
-            notes += [several_kinds(self.reader.image_names), self.reader.left_out]
+            notes += [several_kinds(self.reader.image_names)]
             notes += [missing_numbers(self.reader.image_names)]
         elif self.files.frame_rate is not None:
             rate = float(self.reader.info.frame_rate)

@@ -112,7 +112,8 @@ class VideoReader:
     Attributes:
         info: Frame rate and size, as the file states them.
         pixel_aspect: Width of a pixel against its height.
-        left_out: A line about pictures of a folder that are of kinds that are not read, if any are.
+        left_out: A line about what is not read, if there is such: pictures of other kinds in a
+            folder, further films in a file.
 
     Raises:
         VideoError: If nothing can be read, no frame is selected, or the stride is not positive.
@@ -298,6 +299,11 @@ class VideoReader:
                     raise self._not_a_video("its first frame cannot be decoded")
                 height, width = _upright(first, stream).shape[:2]
                 aspect = stream.sample_aspect_ratio or Fraction(1)
+                if (count := len(container.streams.video)) > 1:
+                    self.left_out = (
+                        f"{count} films or covers in one file: the first, of {width} x {height} "
+                        "pixels, is read"
+                    )
                 is_turned = (width, height) != (first.width, first.height)
                 self.pixel_aspect = 1 / aspect if is_turned else aspect
         except VideoError:
