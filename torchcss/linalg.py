@@ -25,9 +25,11 @@ MATRICES_AT_ONCE = 256
 """Matrices inverted at a time: a few copies of them stay in the caches."""
 
 
-LEAST_CURVATURE = 1.0
+LEAST_CURVATURE = 100.0
 """Floor on the eigenvalues of a Hessian that is not positive definite on the free variables, nats
-per squared deviation of the prior. Ours: the papers invert the Hessian and say nothing of this."""
+per squared deviation of the prior: such a direction is a tenth as wide as the prior, some degrees,
+about what a joint moves in a frame. Ours: the papers invert the Hessian and say nothing of this.
+With 1, samples of the printed cost, of which most ends need the floor, go all over the limits."""
 
 LEAST_DEVIATION = 1e-2
 """Metres or radians within which a parameter that a bound holds counts as the same, where modes of

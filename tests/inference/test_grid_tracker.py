@@ -12,6 +12,7 @@ from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import EigenDirectionGrid
+from torchcss.linalg import LEAST_CURVATURE
 from torchcss.tracking.recovery import Recovery
 from torchcss.types import LocalModel, Status
 
@@ -150,12 +151,12 @@ def test_nothing_is_random_and_steps_are_pure():
 
 
 def test_floored_hessians_are_counted():
-    """Of a parameter about which the cost says nothing, the deviation is the prior's."""
-    problem = SearchProblem(bowl(4.0, 0.0))
+    """Of a parameter about which the cost says nothing, the deviation is that of the floor."""
+    problem = SearchProblem(bowl(40.0, 0.0))
     start = ARM.init(problems.single(), generator=START)
     state, info = ARM.step(start, problem, BOUNDS)
     assert int(info.num_floored) == 3
-    expected = torch.tensor([0.25, 9.0]).double()
+    expected = torch.tensor([1 / 40, 9.0 / LEAST_CURVATURE]).double()
     torch.testing.assert_close(state.mixture.covariance[0].diagonal(), expected)
 
 

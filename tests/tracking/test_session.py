@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError, OutputError, TorchcssError, VideoError
 from torchcss.inference.mixture import GaussianMixture
+from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Particles, Tracker, TrackerState
 from torchcss.initialise.result import Initialisation
 from torchcss.initialise.view import CameraView
@@ -313,6 +314,22 @@ def test_the_papers_start_from_one_fit_whose_covariance_nothing_caps():
         torch.testing.assert_close(
             covariance.diagonal()[free], torch.full_like(covariance.diagonal()[free], variance)
         )
+
+
+@pytest.mark.parametrize("preset", ["ijrr_css", "ijrr_css_spherical", "ijrr_cham_rehg"])
+def test_the_papers_first_hypotheses_are_drawn_from_the_fit_as_it_is(preset: str):
+    """Section 5 [IJRR]; from then on the proposal is the preset's."""
+    body, nothing = load_body("arm8"), cast("Any", None)
+    camera = Camera.pinhole(64, 48, focal_px=50.0)
+    settings = Settings(preset=preset, body="arm8")
+    session = TrackingSession(settings, start_at(body, body.rest), camera)
+    own = session.plan.tracker
+    assert isinstance(own, Tracker)
+    first = session._tracker(nothing, nothing, 1.0)
+    assert first == replace(own, proposal=CovarianceScaled(covariance_scale=1.0))
+    state = session.state.tracker._replace(frame=torch.tensor(1))
+    session.state = session.state._replace(tracker=state)
+    assert session._tracker(nothing, nothing, 1.0) == own
 
 
 def test_base_follows_a_body_that_leans_over(generator: torch.Generator):

@@ -24,9 +24,9 @@ gives beside it wins (`Settings.changed`).
 Modes are the papers': 3 for an arm, 7 for a body, 10 for Cham and Rehg's. What the papers leave
 open is ours: the numbers of samples and particles, the search noise of the rows that search by it
 (a multiple of the everyday motion of one frame), the step limit and the tolerance of descents, the
-degrees of freedom of the t, and that modes of which no joint centre is 3 cm apart are confounded
-minima. A filter gets as many evaluations of the cost as a descending tracker may take, 20 per
-sample that descends to the end.
+degrees of freedom of the t, that modes of which no joint centre is 3 cm apart are confounded
+minima, and `torchcss.linalg.LEAST_CURVATURE`. A filter gets as many evaluations of the cost as a
+descending tracker may take, 20 per sample that descends to the end.
 
 The papers' rows (decision "papers' presets") have the papers' terms (`Preset.terms`), no recovery,
 no flips, no descents on a coarser cost, driftless diffusion where that is printed, keypoints in the

@@ -41,7 +41,7 @@ from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError
 from torchcss.inference.loss_monitor import MonitorState
 from torchcss.inference.mixture import GaussianMixture, tempered
-from torchcss.inference.proposals import with_moves
+from torchcss.inference.proposals import CovarianceScaled, with_moves
 from torchcss.inference.tracker import (
     SequenceTracker,
     Tracker,
@@ -500,6 +500,8 @@ class TrackingSession:
             tracker = recovery.widened(tracker)
         if not isinstance(tracker, Tracker):
             return tracker
+        if plan.one_fit and int(state.tracker.frame) == 0:
+            tracker = replace(tracker, proposal=_AS_FITTED)
         search, dynamics, num = tracker.proposal, tracker.dynamics, tracker.num_samples
         camera, moves = self._observers[0].view.camera, []
         if lost or self._flips_now():
@@ -535,6 +537,11 @@ class TrackingSession:
         best = modes.mean[:1]
         values = cost.terms(best) | cost.weight_only_terms(best)
         return {name: float(value[0]) for name, value in values.items()}
+
+
+_AS_FITTED = CovarianceScaled(covariance_scale=1.0)
+"""Section 5 [IJRR]: the covariance of the one fit gives the first hypotheses, the fit among them.
+Fig. 6 inflates what it was in the frame before."""
 
 
 def _one_fit(first: Initialisation, bounds: Bounds) -> GaussianMixture:
