@@ -358,6 +358,14 @@ def test_a_film_with_times_of_its_frames(tmp_path: Path) -> None:
         assert reader.varies
 
 
+def test_times_that_do_not_rise_are_a_tick_apart(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4", 25) as film:
+        for time in (0.0, 0.04, 0.04, 0.03):
+            film.write(np.zeros((48, 64, 3), np.uint8), time)
+    times = VideoReader(tmp_path / "a.mp4").frame_times()
+    assert times == pytest.approx([0.0, 0.04, 0.04 + 1 / 90_000, 0.04 + 2 / 90_000], abs=1e-6)
+
+
 def test_an_edit_list_hides_frames(tmp_path: Path) -> None:
     """A telephone trims a film by an edit list: players, and we, begin where it says."""
     path, hidden = tmp_path / "a.mp4", 4

@@ -8,6 +8,7 @@ from dataclasses import replace
 from html import escape, unescape
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from made_clip import grey_film
@@ -42,6 +43,8 @@ def folder(tmp_path: Path) -> Path:
 def test_the_page_needs_nothing_else_and_holds_what_was_noted(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    run = Run.open(folder)
+    save_track(folder / TRACK_NAME, run.track._replace(times=np.array([0.5, 0.54, 0.7])))
     monkeypatch.setattr(report, "MOST_PICTURES", 2)
     page = report.write_report_page(Run.open(folder)).read_text()
     assert set(re.findall(r'(?:src|href|poster)="(.{11})', page)) == {
@@ -55,7 +58,9 @@ def test_the_page_needs_nothing_else_and_holds_what_was_noted(
     found = re.search(r"data:video/mp4;base64,([^\"]+)", page)
     assert found is not None
     (tmp_path / "film.mp4").write_bytes(base64.b64decode(found[1]))
-    film = [frame.image for frame in VideoReader(tmp_path / "film.mp4")]
+    reader = VideoReader(tmp_path / "film.mp4")
+    assert reader.frame_times() == pytest.approx([0.0, 0.2], abs=1e-4)
+    film = [frame.image for frame in reader]
     assert [image.shape for image in film] == [(480, 640, 3)] * 2
     assert film[1].mean() == pytest.approx(200, abs=4)
 

@@ -16,9 +16,10 @@ from torchcss.errors import CameraError, TrackFileError, VideoError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.run import Given, Run
 from torchcss.io.tracks import TRACK_NAME, Track, save_track, write_summary
+from torchcss.io.video import VideoReader
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show.posterior_plots import plot_track
-from torchcss.show.track_pictures import has_pictures, pictures_of
+from torchcss.show.track_pictures import has_pictures, pictures_of, write_overlays
 from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
 
@@ -89,6 +90,13 @@ def test_a_smoothed_track_is_drawn_over_the_video_that_the_run_knows(
     assert len(list(pictures_of(Run.open(folder / "smooth.npz"), range(3)))) == 3
     (folder / "video.mp4").unlink()
     assert not has_pictures(Run.open(folder / "smooth.npz"))
+
+
+def test_a_film_shows_its_frames_when_the_camera_took_them(folder: Path, track: Track) -> None:
+    save_track(folder / TRACK_NAME, track._replace(times=np.array([0.5, 0.54, 0.7])))
+    run = Run.open(folder, Given(video=folder / "video.mp4"))
+    (overlay,) = write_overlays(run, 10.0)
+    assert VideoReader(overlay).frame_times() == pytest.approx([0.0, 0.04, 0.2], abs=1e-4)
 
 
 def test_a_track_alone_is_enough(folder: Path) -> None:

@@ -465,7 +465,7 @@ class VideoWriter:
             raise ConfigurationError(f"crf must lie between 0 and 51, got {crf}")
         if not 0 < frame_rate < 1e6:
             raise ConfigurationError(f"frames per second must be positive, got {frame_rate}")
-        self.num_frames = 0
+        self.num_frames = self._next = 0
         self._rate = self._ticks = Fraction(frame_rate).limit_denominator(65535)
         self._crf = crf
         self._partial = temporary_name(self.path)
@@ -478,8 +478,8 @@ class VideoWriter:
 
         Args:
             image: The frame.
-            time_s: When it is shown, seconds, after the one before; of all frames or of none. None:
-                as many frames come a second as the film says.
+            time_s: When it is shown, seconds, a tick after the one before at the earliest; of all
+                frames or of none. None: as many frames come a second as the film says.
 
         Raises:
             ShapeError: If it is not an 8-bit colour image of the first frame's size.
@@ -505,7 +505,9 @@ class VideoWriter:
                     self._ticks = Fraction(_TICKS)
                 self._open(image.shape[1], image.shape[0])
             picture = VideoFrame.from_ndarray(image, format="rgb24")
-            picture.pts = self.num_frames if time_s is None else round(time_s * self._ticks)
+            shown = 0 if time_s is None else round(time_s * self._ticks)
+            picture.pts = max(shown, self._next)
+            self._next = picture.pts + 1
             self._container.mux(self._stream.encode(picture))
         except _av_errors() as error:
             raise output_error(self.path, error) from error

@@ -155,10 +155,10 @@ def _film(run: Run, *, anew: bool) -> str:
         path = Path(folder) / "film.mp4"
         with VideoWriter(path, rate, crf=_CRF) as film:
             try:
-                for _, image in pictures_of(run, rows, anew=anew):
+                for row, image in pictures_of(run, rows, anew=anew):
                     picture = Image.fromarray(image)
                     picture.thumbnail((LONGER_SIDE, LONGER_SIDE))
-                    film.write(np.asarray(picture))
+                    film.write(np.asarray(picture), run.track.times[row] - times[0])
                     if not still.tell():
                         picture.save(still, "JPEG")
             except VideoError as error:

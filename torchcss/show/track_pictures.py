@@ -44,11 +44,12 @@ def caption(frame: int, num_modes: int, cost: float) -> str:
 def write_overlays(run: Run, frame_rate: float) -> list[Path]:
     """Draw the films of a run: `overlay.mp4`, `overlay_2.mp4` and so on, one a camera.
 
-    A further camera's film is black where its video has ended.
+    Frames are shown when the first camera took them. A further camera's film is black where its
+    video has ended.
 
     Args:
         run: The run.
-        frame_rate: Frames per second of the films.
+        frame_rate: Mean frames per second of the films.
 
     Returns:
         The files.
@@ -56,7 +57,7 @@ def write_overlays(run: Run, frame_rate: float) -> list[Path]:
     Raises:
         TorchcssError: If a video cannot be read, or a film not be written.
     """
-    films = []
+    films, times = [], run.track.times
     for place, recorded in enumerate(run.cameras):
         if recorded.files is None:
             continue
@@ -65,7 +66,8 @@ def write_overlays(run: Run, frame_rate: float) -> list[Path]:
         with VideoWriter(run.folder / name, frame_rate) as film:
             for row, image in _frames_of(run, recorded, range(len(run.track.frames))):
                 image = np.zeros((height, width, 3), np.uint8) if image is None else image
-                film.write(draw_modes(image, run.body, run.track.modes(row), recorded.camera))
+                drawn = draw_modes(image, run.body, run.track.modes(row), recorded.camera)
+                film.write(drawn, times[row] - times[0])
         films.append(run.folder / name)
     return films
 
