@@ -150,6 +150,12 @@ def test_bad_configuration(name: str, value: Any):
         LossMonitor(**{name: value})
 
 
+def test_a_window_holds_what_is_learnt_before_anything_is_judged():
+    with pytest.raises(ConfigurationError, match=r"LossMonitor\.burn_in: .* the window"):
+        LossMonitor(window=5)
+    assert LossMonitor(burn_in=5, window=5).burn_in == 5
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator: torch.Generator):
     narrow = make_tracker(preset, "arm8", num_samples=10, num_modes=2, motion=0.1)

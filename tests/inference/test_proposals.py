@@ -440,6 +440,11 @@ def test_bad_choices():
         (lambda: Diffusion(deviation=-0.1), "Diffusion.deviation: expected at least 0"),
         (lambda: ConstantVelocity(deviation=(0.1, math.inf)), "ConstantVelocity.deviation"),
         (lambda: ConstantVelocity(persistence=math.nan), "ConstantVelocity.persistence"),
+        (
+            lambda: Aside(search=NEAR, distances=(), log_odds=math.nan),
+            "Aside.log_odds: expected a finite number",
+        ),
+        (lambda: Aside(search=NEAR, distances=(), log_odds=-math.inf), "Aside.log_odds"),
         (lambda: MixtureOfProposals(proposals=()), "at least one"),
         (lambda: MixtureOfProposals(proposals=(ALL[0],), shares=(0.0,)), "shares"),
         (lambda: MixtureOfProposals(proposals=(ALL[0],), shares=(0.5, 0.5)), "one share for each"),

@@ -20,7 +20,7 @@ import statistics
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from torchcss.errors import check_positive
+from torchcss.errors import check_positive, check_range
 from torchcss.types import frozen
 
 
@@ -62,6 +62,7 @@ class LossMonitor:
 
     def __post_init__(self) -> None:
         check_positive(self, "slack", "threshold", "most", "burn_in", "window", "floor")
+        check_range(self, "burn_in", most=self.window, hint=", the window: no more is remembered")
 
     def init(self) -> MonitorState:
         """Know nothing yet."""

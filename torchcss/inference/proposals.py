@@ -681,6 +681,11 @@ class Move(Proposal):
     search: Proposal
     log_odds: float = -5.0
 
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.log_odds):
+            where = f"{type(self).__name__}.log_odds"
+            raise ConfigurationError(f"{where}: expected a finite number, got {self.log_odds}")
+
     @abstractmethod
     def states(self, best: GaussianMixture, bounds: Bounds) -> Vectors:
         """Other states, the most plausible first.
