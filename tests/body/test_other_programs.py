@@ -133,6 +133,20 @@ def test_equality_of_joints(tmp_path: Path, coefficients: str) -> None:
     assert any("'right': its equality is left out" in note for note in body.notes)
 
 
+def test_soft_bodies_are_told(tmp_path: Path) -> None:
+    """MuJoCo refuses the one, and makes joints of every point of the other."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "a.xml").write_text(
+        """<mujoco><worldbody><body><joint name="turn"/><geom size=".02"/>
+        <composite prefix="rope" type="cable" curve="s" count="5 1 1" size="1"/>
+        <flexcomp name="cloth" type="grid" count="3 3 1" dim="2"><pin id="0 1"/></flexcomp>
+        </body></worldbody></mujoco>"""
+    )
+    body = load_body(tmp_path / "a.xml")
+    assert body.state_names == ("turn",)
+    assert "a.xml: soft bodies are left out: rope (composite), cloth (flexcomp)" in body.notes
+
+
 def bvh(up: int = 1, motion: str = "MOTION\nFrames: 1\nFrame Time: 0.04\n{rows}\n") -> str:
     """Somebody who stands along an axis."""
 

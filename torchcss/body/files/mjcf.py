@@ -43,9 +43,12 @@ _SOLIDS = {2: ("sphere", 1), 3: ("capsule", 2), 4: ("ellipsoid", 3), 5: ("cylind
 
 _KEPT = (
     *("compiler", "default", "asset", "model", "worldbody", "body", "frame", "joint", "freejoint"),
-    *("geom", "replicate", "attach", "flexcomp", "equality"),
+    *("geom", "replicate", "attach", "equality"),
 )
 """Elements that say what a body is; others go, with what they hold."""
+
+_SOFT = ("composite", "flexcomp")
+"""Elements that make cloth, ropes and the like of bodies of their own."""
 
 _NAMES = ("name", "class", "childclass", "prefix", "mesh", "hfield", "model", "body", "file",
           "joint1", "joint2")  # fmt: skip
@@ -71,15 +74,17 @@ def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
             expands to very many bodies.
         MissingExtraError: If MuJoCo is not installed.
     """
-    model, meshed, left_out = _compiled(path)
+    model, meshed, screen = _compiled(path)
     if not model.njnt and model.nbody < 2:
         raise BodyError(f"{path}: no <body> in the <worldbody>; expected an MJCF of a body")
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     joints = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
     chosen = max(tops, key=lambda body: joints[body])
     notes = ["limits, axes and solids: as the MJCF says"]
-    if left_out:
-        notes.append(f"equalities of other things than joints are left out: {', '.join(left_out)}")
+    if left_out := ", ".join(screen.left_out):
+        notes.append(f"equalities of other things than joints are left out: {left_out}")
+    if screen.soft:
+        notes.append(f"soft bodies are left out: {', '.join(screen.soft)}")
     if len(tops) > 1:
         others = [model.body(body).name or "without name" for body in tops if body != chosen]
         notes.append(f"of several bodies the one with most joints; not {', '.join(others)}")
@@ -98,6 +103,7 @@ class _Screen:
         self.path = path
         self.num_files = 0
         self.left_out: list[str] = []
+        self.soft: list[str] = []
         self.attached: dict[str, ElementTree.Element] = {}
         self.sizes: dict[ElementTree.Element, float] = {}
 
@@ -123,10 +129,10 @@ class _Screen:
                 children += self.read(child.get("file", ""))
             elif element.tag == "equality" and child.tag != "joint":
                 self.left_out.append(child.tag)
+            elif child.tag in _SOFT:
+                self.soft.append(f"{child.get('name', child.get('prefix'))} ({child.tag})")
             elif child.tag in _KEPT:
                 child.attrib.pop("material", None)
-                if child.tag == "flexcomp":
-                    child.attrib.pop("file", None)
                 self._check_numbers(child)
                 self._strip(child)
                 children.append(child)
@@ -157,9 +163,7 @@ class _Screen:
                 return total + 1
             if element.tag == "attach" and (name := files.get(element.get("model"))) is not None:
                 return self.num_bodies(self.attached[name])
-            if element.tag == "replicate":
-                return total * _product(element.get("count", ""))
-            return _product(element.get("count", "")) if element.tag == "flexcomp" else total
+            return total * (_count(element) if element.tag == "replicate" else 1)
 
         if root not in self.sizes:
             self.sizes[root] = math.inf  # of a file that attaches itself
@@ -167,15 +171,15 @@ class _Screen:
         return self.sizes[root]
 
 
-def _product(words: str) -> float:
+def _count(replicate: ElementTree.Element) -> float:
     try:
-        return math.prod(float(word) for word in words.split())
+        return float(replicate.get("count", ""))
     except ValueError:
         return 1  # the compiler says what is wrong
 
 
-def _compiled(path: Path) -> tuple[Any, list[str], list[str]]:
-    """The file as MuJoCo compiles it, the bodies whose meshes are left out, other equalities."""
+def _compiled(path: Path) -> tuple[Any, list[str], _Screen]:
+    """The file as MuJoCo compiles it, the bodies whose meshes are left out, and its screen."""
     mujoco = optional_package(
         "mujoco",
         f"{path}: an MJCF file is read by MuJoCo; install it: pip install 'torchcss[mjcf]'",
@@ -202,7 +206,7 @@ def _compiled(path: Path) -> tuple[Any, list[str], list[str]]:
                     )
             spec.compiler.fusestatic = spec.compiler.discardvisual = False
             spec.compiler.boundmass = spec.compiler.boundinertia = _LIGHT
-            return spec.compile(), list(meshed), screen.left_out
+            return spec.compile(), list(meshed), screen
     except (ValueError, mujoco.FatalError) as error:
         reason = re.sub(r",? line \d+", "", one_line(error))  # of what was handed over
         raise BodyError(f"{path}: MuJoCo cannot read this MJCF: {reason}") from error
