@@ -12,6 +12,7 @@ from made_clip import grey_film
 from made_tracks import make_track
 
 from torchcss.body.model import BodyModel
+from torchcss.cli import main as cli
 from torchcss.errors import CameraError, TrackFileError, VideoError
 from torchcss.io.cameras import camera_entry
 from torchcss.io.run import Given, Run
@@ -20,6 +21,7 @@ from torchcss.io.video import VideoReader
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.show.posterior_plots import plot_track
 from torchcss.show.track_pictures import has_pictures, pictures_of, write_overlays
+from torchcss.show.viewer import shown_frames
 from torchcss.studies.render.scene import look_at
 from torchcss.vision.camera import Camera
 
@@ -90,6 +92,20 @@ def test_a_smoothed_track_is_drawn_over_the_video_that_the_run_knows(
     assert len(list(pictures_of(Run.open(folder / "smooth.npz"), range(3)))) == 3
     (folder / "video.mp4").unlink()
     assert not has_pictures(Run.open(folder / "smooth.npz"))
+
+
+def test_where_the_video_is_gone_what_the_overlay_has_is_shown(
+    folder: Path, track: Track, camera: Camera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = ViewFiles(video=folder / "gone.mp4", keypoints=None)
+    save_track(folder / TRACK_NAME, track._replace(cameras=(RecordedCamera(camera, files),)))
+    grey_film(folder / "overlay.mp4", (40, 120), camera.image_size_wh)
+    assert cli.main(["plot", str(folder)]) == 0
+    told = capsys.readouterr().out
+    assert "frames.png" in told
+    assert "overlay.mp4: 1 frames of the track are missing; give the video" in told
+    shown = [frame.picture is not None for frame in shown_frames(Run.open(folder))]
+    assert shown == [True, True, False]
 
 
 def test_a_film_shows_its_frames_when_the_camera_took_them(folder: Path, track: Track) -> None:

@@ -7,8 +7,14 @@ from pathlib import Path
 
 from torchcss.cli.options import GivenOptions, PathArgument
 from torchcss.io.run import Given, Run
-from torchcss.show.track_pictures import has_pictures
+from torchcss.show.track_pictures import without_pictures
 from torchcss.types import frozen
+
+
+def _tell_missing(run: Run) -> None:
+    """Say which frames have no pictures, if there are such."""
+    if (told := without_pictures(run)) is not None:
+        print(told)
 
 
 @frozen
@@ -29,8 +35,7 @@ class View:
 
         run = Run.open(self.track, self.given)
         view_track(run, save=self.save, connect=self.connect, anew=self.given.video is not None)
-        if not has_pictures(run):
-            print("without pictures: give --video (and --camera) to see what the modes explain")
+        _tell_missing(run)
         if self.save is not None:
             print(f"wrote {self.save}; open it with: rerun {shlex.quote(str(self.save))}")
 
@@ -55,6 +60,7 @@ class Plot:
         anew = self.given.video is not None
         for path in plot_track(run, self.out, frame=self.frame, anew=anew):
             print(f"wrote {path}")
+        _tell_missing(run)
 
 
 @frozen

@@ -27,7 +27,7 @@ from torchcss.io.run import Run
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
-from torchcss.show.track_pictures import has_pictures, pictures_of
+from torchcss.show.track_pictures import has_pictures, pictures_of, without_pictures
 from torchcss.show.track_plots import (
     check_not_empty,
     modes_figure,
@@ -150,7 +150,7 @@ def _film(run: Run, *, anew: bool) -> str:
     rows = range(0, count, math.ceil(count / MOST_PICTURES))
     times = run.track.times[rows]
     rate = (len(rows) - 1) / float(times[-1] - times[0]) if len(rows) > 1 else 1.0
-    still, missing = BytesIO(), ""
+    still, missing = BytesIO(), without_pictures(run)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         with VideoWriter(path, rate, crf=_CRF) as film:
@@ -165,13 +165,13 @@ def _film(run: Run, *, anew: bool) -> str:
                 # A film that ends before a track that went on is worth showing.
                 if anew or not still.tell():
                     raise
-                missing = f"<p>It ends before the track: {escape(str(error))} (--video).</p>"
+                missing = str(error)
         data = _data("video/mp4", path.read_bytes())
     return (
         f'<video controls loop muted playsinline poster="{_data("image/jpeg", still.getvalue())}" '
         f'src="{data}"></video>'
         "<p>Filled: the best mode. Outlines: the other modes, fainter the less they weigh.</p>"
-        + missing
+        + (f"<p>It ends before the track: {escape(missing)} (--video).</p>" if missing else "")
     )
 
 

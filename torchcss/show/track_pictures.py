@@ -90,6 +90,22 @@ def has_pictures(run: Run) -> bool:
     return overlay_of(run) is not None or known_video(run) is not None
 
 
+def without_pictures(run: Run) -> str | None:
+    """A line about frames that nothing shows, as the video is gone; None: there are none.
+
+    Raises:
+        VideoError: If the overlay cannot be read.
+    """
+    overlay, count = overlay_of(run), len(run.track.frames)
+    if known_video(run) is not None:
+        return None
+    if overlay is None:
+        return "without pictures: give --video (and --camera) to see what the modes explain"
+    left = count - VideoReader(overlay).count_frames()
+    told = f"{overlay}: {left} frames of the track are missing; give the video that was tracked"
+    return told if left > 0 else None
+
+
 def pictures_of(
     run: Run, rows: Iterable[int], *, anew: bool = False
 ) -> Iterator[tuple[int, Picture]]:
@@ -101,10 +117,10 @@ def pictures_of(
         anew: Whether to draw over the video even where the tracker left an overlay.
 
     Yields:
-        Row and picture; nothing if there is neither video nor overlay.
+        Row and picture; nothing of frames that neither video nor overlay has (`without_pictures`).
 
     Raises:
-        VideoError: If the video lacks a frame.
+        VideoError: If there is a video and it lacks a frame.
         CameraError: If the camera is of another image size.
         TrackFileError: If the body or the camera is not known.
     """
@@ -122,10 +138,9 @@ def pictures_of(
             if image is not None:
                 left.remove(row)
                 yield row, draw_modes(image, run.body, run.track.modes(row), first.camera)
-    if left:
+    if left and video is not None:
         raise VideoError(
-            f"{video or overlay}: {len(left)} frames of the track are missing; give the video that "
-            "was tracked"
+            f"{video}: {len(left)} frames of the track are missing; give the video that was tracked"
         )
 
 
