@@ -108,6 +108,23 @@ def test_where_the_video_is_gone_what_the_overlay_has_is_shown(
     assert shown == [True, True, False]
 
 
+def test_a_video_outside_the_run_is_told(
+    folder: Path, track: Track, camera: Camera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A run may come from a stranger, and name any file."""
+    out, video = folder / "out", folder / "video.mp4"
+    out.mkdir()
+    files = ViewFiles(video=video, keypoints=None)
+    save_track(out / TRACK_NAME, track._replace(cameras=(RecordedCamera(camera, files),)))
+    for more, is_told in ([], True), (["--video", str(video)], False):
+        assert cli.main(["report", str(out), *more]) == 0
+        assert (f"outside its folder the run names {video}" in capsys.readouterr().err) == is_told
+    (out / video.name).write_bytes(video.read_bytes())
+    video.unlink()
+    assert cli.main(["report", str(out)]) == 0
+    assert not capsys.readouterr().err
+
+
 def test_a_film_shows_its_frames_when_the_camera_took_them(folder: Path, track: Track) -> None:
     save_track(folder / TRACK_NAME, track._replace(times=np.array([0.5, 0.54, 0.7])))
     run = Run.open(folder, Given(video=folder / "video.mp4"))

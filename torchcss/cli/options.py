@@ -12,14 +12,14 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from torchcss.io.run import Given
+from torchcss.io.run import Given, Run
 from torchcss.io.tracks import TRACK_NAME, read_summary
 from torchcss.tracking.settings import Settings
 from torchcss.types import frozen
@@ -37,6 +37,21 @@ SettingsOptions = Annotated[Settings, tyro.conf.arg(name="")]
 def first_look(folder: Path, settings: Settings) -> Path:
     """The file of a finished run that its user opens first."""
     return folder / ("report.html" if settings.overlay else TRACK_NAME)
+
+
+def tell_outside(run: Run, paths: Iterable[Path | None], given: Sequence[object]) -> None:
+    """Say which files a run names that lie outside its folder: it may be a stranger's.
+
+    Args:
+        run: The run.
+        paths: Files that it names and that may be read.
+        given: Those that were named on the command line.
+    """
+    for path in dict.fromkeys(paths):
+        is_own = path is None or path.resolve().is_relative_to(run.folder.resolve())
+        if path is not None and not is_own and path not in given and path.exists():
+            told = f"outside its folder the run names {path}; another counts first if it is given"
+            print(told, file=sys.stderr)
 
 
 @frozen

@@ -12,9 +12,16 @@ from typing import Annotated
 import tyro
 
 from torchcss.app.smooth import report, smooth
-from torchcss.cli.options import GivenOptions, PathArgument, Terminal, TerminalOptions
+from torchcss.cli.options import (
+    GivenOptions,
+    PathArgument,
+    Terminal,
+    TerminalOptions,
+    tell_outside,
+)
 from torchcss.errors import ConfigurationError
 from torchcss.io.run import Given, GivenKeypoints, Run
+from torchcss.io.view_files import PATHS
 from torchcss.tracking.smooth import Smoothing
 from torchcss.tracking.smooth_images import IMAGES
 from torchcss.types import frozen
@@ -63,5 +70,8 @@ class Smooth:
             choice = replace(choice, acceleration_ratio=self.acceleration_ratio)
         run = Run.open(self.track, self.given, self.keypoints)
         with self.terminal.working():
+            if images:
+                files = [getattr(e.files, n, None) for e in run.cameras for n in PATHS]
+                tell_outside(run, files, (self.given.video, *asdict(self.keypoints).values()))
             done = smooth(run, choice, images=images, out=self.out)
         self.terminal.tell(done.folder, report(done.summary["smoothed"]))

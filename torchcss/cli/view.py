@@ -5,10 +5,17 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from torchcss.cli.options import GivenOptions, PathArgument
+from torchcss.cli.options import GivenOptions, PathArgument, tell_outside
 from torchcss.io.run import Given, Run
-from torchcss.show.track_pictures import without_pictures
+from torchcss.show.track_pictures import known_video, without_pictures
 from torchcss.types import frozen
+
+
+def _opened(track: Path, given: Given) -> Run:
+    """The run, whose video may lie outside its folder."""
+    run = Run.open(track, given)
+    tell_outside(run, [known_video(run)], [given.video])
+    return run
 
 
 def _tell_missing(run: Run) -> None:
@@ -33,7 +40,7 @@ class View:
         """Run the verb."""
         from torchcss.show.viewer import view_track
 
-        run = Run.open(self.track, self.given)
+        run = _opened(self.track, self.given)
         view_track(run, save=self.save, connect=self.connect, anew=self.given.video is not None)
         _tell_missing(run)
         if self.save is not None:
@@ -56,7 +63,7 @@ class Plot:
         """Run the verb."""
         from torchcss.show.posterior_plots import plot_track
 
-        run = Run.open(self.track, self.given)
+        run = _opened(self.track, self.given)
         anew = self.given.video is not None
         for path in plot_track(run, self.out, frame=self.frame, anew=anew):
             print(f"wrote {path}")
@@ -75,5 +82,5 @@ class Report:
         """Run the verb."""
         from torchcss.show.report import write_report_page
 
-        run = Run.open(self.track, self.given)
+        run = _opened(self.track, self.given)
         print(f"wrote {write_report_page(run, anew=self.given.video is not None)}")

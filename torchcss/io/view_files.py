@@ -19,7 +19,7 @@ from torchcss.io.cameras import camera_entry
 from torchcss.io.keypoints.read import Scale
 from torchcss.vision.camera import Camera
 
-_PATHS = ("video", "keypoints", "masks")
+PATHS = ("video", "keypoints", "masks")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class ViewFiles:
 
     def fingerprints(self) -> dict[str, str]:
         """What tells each of its files from others, wherever it lies."""
-        paths = {name: getattr(self, name) for name in _PATHS}
+        paths = {name: getattr(self, name) for name in PATHS}
         return {name: fingerprint(path) for name, path in paths.items() if path is not None}
 
     def moved(self, given: ViewFiles, fingerprints: Mapping[str, str]) -> ViewFiles:
@@ -70,7 +70,7 @@ class ViewFiles:
             ConfigurationError: If one of them is another file.
         """
         now: dict[str, Path] = {}
-        for name in _PATHS:
+        for name in PATHS:
             path, known = getattr(given, name), getattr(self, name)
             if None in (path, known) or path.resolve() == known.resolve():
                 continue
@@ -133,7 +133,7 @@ def camera_to_plain(recorded: RecordedCamera) -> dict[str, Any]:
     if files is None:
         return entry
     plain = asdict(files)
-    for name in _PATHS:
+    for name in PATHS:
         plain[name] = None if plain[name] is None else os.path.abspath(plain[name])
     return {**entry, "files": plain}
 
@@ -163,7 +163,7 @@ def camera_from_plain(entry: Mapping[str, Any], folder: Path) -> RecordedCamera:
     if entry.get("files") is None:
         return RecordedCamera(camera, focal_deviation=focal)
     files = ViewFiles(**entry["files"])
-    places = {name: _place(getattr(files, name), folder) for name in _PATHS}
+    places = {name: _place(getattr(files, name), folder) for name in PATHS}
     return RecordedCamera(camera, replace(files, **places), focal)
 
 
