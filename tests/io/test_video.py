@@ -478,6 +478,38 @@ def test_what_is_read_before_the_damage_are_the_right_frames(
             assert reader.count_frames() == len(frames) >= 50 * size / len(whole) - 8
 
 
+def test_frames_that_a_camera_dropped_are_no_damage(tmp_path: Path) -> None:
+    """Empty chunks of an AVI: the frames around them have their own times."""
+    path = tmp_path / "a.avi"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p"
+        for level in range(0, 240, 30):
+            picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), "rgb24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    data, marks = path.read_bytes(), (2, 3, 6)
+    head, _, rest = data.partition(b"movi")
+    chunks = rest[: rest.index(b"idx1")].split(b"00dc")[1:]
+    chunks = [bytes(4) if place in marks else chunk for place, chunk in enumerate(chunks)]
+    movi = b"".join(b"00dc" + chunk for chunk in chunks)
+    sizes = [int.from_bytes(chunk[:4], "little") for chunk in chunks]
+    places = np.cumsum([4, *(len(chunk) + 4 for chunk in chunks)])
+    index = b"".join(
+        b"00dc" + struct.pack("<III", 16, place, size)
+        for place, size in zip(places, sizes, strict=False)
+    )
+    movi = struct.pack("<I", 4 + len(movi)) + b"movi" + movi
+    path.write_bytes(head[:-4] + movi + b"idx1" + struct.pack("<I", len(index)) + index)
+    reader = VideoReader(path)
+    assert reader.info.num_frames == reader.count_frames() == 5
+    frames = list(reader)
+    assert [frame.time_s * 25 for frame in frames] == pytest.approx([0, 1, 4, 5, 7])
+    levels = [frame.image.mean() for frame in frames]
+    assert levels == pytest.approx([0, 30, 120, 150, 210], abs=3)
+    assert "40 to 120 ms" in (reader.varying_rate() or "")
+
+
 def test_truncated_avi(tmp_path: Path) -> None:
     path = cut(noisy_film(tmp_path / "a.avi"), 0.5)
     frames, error = read_until_error(VideoReader(path))

@@ -294,6 +294,11 @@ class VideoReader:
                     # An edit list may show a part of the frames that are stored.
                     is_whole = abs(round(duration) - num_frames) <= 1
                     num_frames = num_frames if is_whole else self.count_frames()
+                if num_frames and container.format.name == "avi":
+                    # Frames that a camera dropped are empty, and nobody returns them.
+                    shown = [entry.timestamp for entry in stream.index_entries]
+                    has_gaps = len(shown) < num_frames and shown[-1:] == [num_frames - 1]
+                    num_frames = self.count_frames() if has_gaps else num_frames
                 first = next(iter(_decode(container)), None)
                 if first is None:
                     raise self._not_a_video("its first frame cannot be decoded")
