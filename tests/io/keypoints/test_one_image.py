@@ -129,6 +129,13 @@ def test_coco_detections_of_a_picture_with_any_number(tmp_path: Path):
         read_joints(path, image_size_wh=SIZE)
 
 
+def test_numbers_that_leave_out_a_day_are_refused_before_they_take_memory(tmp_path: Path):
+    path, wrist = tmp_path / "a.json", {"l_wrist": [100, 200]}
+    path.write_text(json.dumps({"frames": {"0": wrist, "900000": wrist}}))
+    with pytest.raises(KeypointError, match="2 frames are in the file, the last is number 900000"):
+        read_joints(path, image_size_wh=SIZE)
+
+
 def test_a_picture_with_any_number_that_somebody_annotated(tmp_path: Path):
     path, size = tmp_path / "a.json", {"original_width": 640, "original_height": 480}
     value = {"x": 50, "y": 25, "keypointlabels": ["left_wrist"]}

@@ -22,6 +22,9 @@ from torchcss.io.keypoints.words import TIMES
 
 FRAMES_AT_MOST = 1_000_000
 
+_EMPTY_AT_MOST = 100_000
+"""Frames that a file may leave out where the video's length is not known; each takes memory."""
+
 
 class Film(NamedTuple):
     """What is known of the video.
@@ -74,6 +77,11 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
         raise wrong_count(film.num_frames, total, named=named)
     if total > FRAMES_AT_MOST:
         raise KeypointError(f"{total - 1} is not a frame number; number the frames from 0")
+    if film.num_frames is None and total - len(found) > _EMPTY_AT_MOST:
+        raise KeypointError(
+            f"{len(found)} frames are in the file, the last is number {total - 1}: number the "
+            "frames from 0, or leave only the one that is meant in the file"
+        )
     if len(found) < total:
         report.append(f"{len(found)} of {total} frames are in the file, the others have nobody")
     return [found.get(index, []) for index in range(total)]
