@@ -1123,6 +1123,8 @@ def test_what_a_camera_file_leaves_open_is_told(tmp_path: Path) -> None:
         ("results-cam.txt", "Camera-system parameters:\ncam0 (/a):\n", "give the camchain.yaml"),
         ("a.qca.txt", "<calibration/>", "motion capture system; save it as Pose2Sim's"),
         ("a.pickle", "x", "a pickle, from which code may run"),
+        ("a.p", "x", "a pickle, from which code may run"),
+        ("a.yaml", "a: [" + "1, " * 2**21 + "1]", "more than 4,194,304 bytes; not a calibration"),
         ("a.xml", "<document><chunk/></document>", "save each camera's calibration"),
         ("a.sfm", "{}", "Meshroom's; give K"),
     ],

@@ -163,12 +163,15 @@ _FISHEYE_NUMBERS = re.compile("fish_?eye_?(param|model|coeff)", re.IGNORECASE)
 _MOST_BYTES = 2**26
 """Bytes of the largest calibration, unpacked; MATLAB's hold the pictures' corners too."""
 
+_MOST_YAML = 2**22
+"""Bytes of one in YAML, whose parser takes seconds and fifty times the room for a million."""
+
 _DEEPEST = 50
 """Brackets in brackets of a calibration in YAML."""
 
 _OTHERS = {
     ".sfm .abc": "Meshroom's; give K, image_size_wh and distortion in a cameras.json",
-    ".pickle .pkl": "a pickle, from which code may run: not read; save K, dist, R and t with "
+    ".pickle .pkl .p": "a pickle, from which code may run: not read; save K, dist, R and t with "
     "numpy.savez",
 }
 """Files of other kinds by how their names end, and what to do."""
@@ -1085,7 +1088,8 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 
 
 def _load(path: Path) -> dict[str, Any]:
-    text = read_text(path, CameraError)
+    if len(text := read_text(path, CameraError)) > _MOST_YAML:
+        raise CameraError(f"{path}: more than {_MOST_YAML:,} bytes; not a calibration")
     if text.startswith("%YAML:1.0"):
         text = text.partition("\n")[2]
     with refusing(CameraError, f"{path}: cannot be read as YAML"):

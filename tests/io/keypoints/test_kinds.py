@@ -868,9 +868,10 @@ def test_decimal_commas(tmp_path: Path) -> None:
     check(read(write(tmp_path / "a.csv", "\n".join(rows))))
 
 
-def test_no_pickle_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["a.pkl", "a.p"])
+def test_no_pickle_is_read(tmp_path: Path, name: str) -> None:
     with pytest.raises(KeypointError, match=r"code may run.*numpy\.savez"):
-        read(write(tmp_path / "a.pkl", "x"))
+        read(write(tmp_path / name, "x"))
 
 
 # What files call things, and what they leave out.

@@ -79,8 +79,8 @@ Scale = Literal["pixels", "zero-one", "plus-minus-one"]
 
 _AS_CSV = "save it as CSV"
 _OTHERS = {
-    ".pkl .pickle .pt .pth .joblib": "a pickle, from which code may run: not read; save the arrays "
-    "with numpy.savez(FILE, keypoints=..., confidence=..., joint_names=...)",
+    ".pkl .pickle .p .pt .pth .joblib": "a pickle, from which code may run: not read; save the "
+    "arrays with numpy.savez(FILE, keypoints=..., confidence=..., joint_names=...)",
     " ".join(VIDEO_SUFFIXES): "a video; torchcss detect VIDEO --out "
     "keypoints.npz finds the keypoints in it",
     ".jpg .jpeg .png .bmp .tif .tiff .webp": "a picture; torchcss init PICTURE --click marks its "
