@@ -63,6 +63,7 @@ _OPENPOSE_ARMS = _columns("nose vt1 r_shoulder r_elbow r_wrist l_shoulder l_elbo
 _OPENPOSE_LEGS = _columns("r_hip r_knee r_ankle l_hip l_knee l_ankle")
 _OPENPOSE_HEAD = _columns("r_eye l_eye r_ear l_ear")
 _BODY_19 = (*_OPENPOSE_ARMS, "HumanoidRoot", *_OPENPOSE_LEGS, *_OPENPOSE_HEAD)
+_COCO_18 = (*_OPENPOSE_ARMS, *_OPENPOSE_LEGS, *_OPENPOSE_HEAD)
 _H36M = _columns("HumanoidRoot r_hip r_knee r_ankle l_hip l_knee l_ankle - vt1")
 _H36M_END = _columns("skull_tip l_shoulder l_elbow l_wrist r_shoulder r_elbow r_wrist")
 # AlphaPose's body with feet: COCO's order, then MPII's head top, upper neck and hips' middle, then
@@ -73,6 +74,12 @@ _MHR = (
     *(*20 * (None,), "r_wrist", *20 * (None,), "l_wrist", *6 * (None,), "vt1"),
 )
 _FACE_AND_HANDS = (None,) * 110
+# The eyes' inner and outer corners, the mouth and the knuckles are no joints of ours.
+_MEDIAPIPE = _columns(
+    "nose - l_eye - - r_eye - l_ear r_ear - - "
+    "l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist - - - - - - "
+    "l_hip r_hip l_knee r_knee l_ankle r_ankle l_heel r_heel l_toe r_toe"
+)
 
 ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     # OpenPose's default: 1 Neck, 8 MidHip, 19 to 24 the feet (big toe, small toe, heel).
@@ -80,7 +87,7 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     # OpenPose's experimental model: COCO's order, upper neck and head top, then the feet.
     "BODY_25B": (*_COCO, "vc7", "skull_tip", *_COCO_FEET),
     "COCO-17": _COCO,
-    "COCO-18": (*_OPENPOSE_ARMS, *_OPENPOSE_LEGS, *_OPENPOSE_HEAD),
+    "COCO-18": _COCO_18,
     # MMPose, RTMPose and DWPose: COCO's order and the feet, then face and hands.
     "COCO-133": (*_COCO, *_COCO_FEET, *_FACE_AND_HANDS),
     # SAM 3D Body, and Sapiens with a face: wrists stand behind their fingers.
@@ -114,12 +121,9 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
     "BODY_18": _BODY_19[:18],
     "Halpe-26": _HALPE,
     "Halpe-136": (*_HALPE, *_FACE_AND_HANDS),
-    # The eyes' inner and outer corners, the mouth and the knuckles are no joints of ours.
-    "MediaPipe-33": _columns(
-        "nose - l_eye - - r_eye - l_ear r_ear - - "
-        "l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist - - - - - - "
-        "l_hip r_hip l_knee r_knee l_ankle r_ankle l_heel r_heel l_toe r_toe"
-    ),
+    "MediaPipe-33": _MEDIAPIPE,
+    # Its first model, of the upper body.
+    "MediaPipe-25": _MEDIAPIPE[:25],
     # 7 is the middle of the spine and 9 lies between nose and neck: neither is a place of ours.
     "H36M-17": (*_H36M, None, *_H36M_END),
     # Without the place between nose and neck.
@@ -140,6 +144,9 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
         "HumanoidRoot l_hip r_hip vl5 l_knee r_knee - l_ankle r_ankle - l_midtarsal r_midtarsal "
         "vt1 - - skullbase l_shoulder r_shoulder l_elbow r_elbow l_wrist r_wrist - -"
     ),
+    # DWPose as ControlNet has it: OpenPose's body, the feet, then face and hands.
+    "DWPose-24": (*_COCO_18, *_COCO_FEET),
+    "DWPose-134": (*_COCO_18, *_COCO_FEET, *_FACE_AND_HANDS),
     "H-Anim": JOINT_NAMES,
 }
 """Layout name to the catalogue's name of every column, `None` for a place that has none."""

@@ -399,6 +399,16 @@ def test_ambiguous_layouts_are_reported(tmp_path: Path) -> None:
         frame[8, 2] = 0.0
     found = read(write_npz(tmp_path / "b.npz", hidden))
     assert any("BODY_25B" in line and "set layout" in line for line in found.report)
+    upper = write_npz(tmp_path / "c.npz", moving("MediaPipe-25"))
+    told = "(MediaPipe-25 has as many: set layout, --layout)"
+    assert any("BODY_25B" in line and told in line for line in read(upper).report)
+    check(read(upper, layout="MediaPipe-25"), moving("MediaPipe-25"), "MediaPipe-25")
+    necks = moving("DWPose-24")
+    for frame in necks:
+        frame[1, :2] = 0.5 * (frame[2, :2] + frame[5, :2])
+    check(read(write_npz(tmp_path / "d.npz", necks)), necks, "DWPose-24")
+    told = "layout: SMPL-24, by its 24 joints (DWPose-24 has as many: set layout, --layout)"
+    assert told in read(write_npz(tmp_path / "e.npz", moving("SMPL-24"))).report
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ Frame numbers, times and names of pictures are used where a file has them; a fil
 order must have as many entries as the video has frames.
 
 Files that name their joints are read by name; the others by layout, which their number of joints
-tells (25 is BODY_25 or BODY_25B: the places of the points decide). Out come the catalogue's names
+tells (of 25 the places of the points decide whether it is BODY_25). Out come the catalogue's names
 (`torchcss.joint_names`); a joint that has none keeps its own. For a body from a file, such as a
 robot, the names of its links count too (`torchcss.io.keypoints.links`). A missing joint has
 confidence 0 and stands at (0, 0). Of several people, one is followed, by the file's own tracks
@@ -564,7 +564,7 @@ def _names_of_people(
 
 _MIDDLES = {
     "BODY_25": ((8, 9, 12),), "BODY_18": ((8, 9, 12),),
-    "Kinect-25": ((0, 12, 16), (20, 4, 8)),
+    "Kinect-25": ((0, 12, 16), (20, 4, 8)), "DWPose-24": ((1, 2, 5),),
     "H36M-17": ((0, 1, 4), (7, 0, 8), (8, 11, 14)), "3DHP-17": ((14, 8, 11), (1, 2, 5)),
     "H36M-16": ((0, 1, 4), (7, 0, 8), (8, 10, 13)),
     "HumanEva-15": ((0, 8, 11),), "MPI-15": ((1, 2, 5),),
@@ -602,9 +602,10 @@ def _recognise(chosen: np.ndarray) -> tuple[str, str]:
             f"{num_joints} joints without names, of which it is not clear whether they are those "
             f"of {', '.join(candidates)}: say so (--layout)"
         )
-    if refuted and plain[0] != candidates[0]:
-        return plain[0], f"by its {num_joints} joints, {refuted}"
+    reason = f"by its {num_joints} joints"
     others = [each for each in candidates if each != plain[0]]
+    if refuted and plain[0] != candidates[0]:
+        reason, others = f"{reason}, {refuted}", plain[1:]
     have = "has" if len(others) == 1 else "have"
-    told = f"({', '.join(others)} {have} as many: set layout)"
-    return plain[0], f"by its {num_joints} joints {told}"
+    told = f" ({', '.join(others)} {have} as many: set layout, --layout)" if others else ""
+    return plain[0], f"{reason}{told}"
