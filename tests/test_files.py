@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from made_clip import grey_film
+from made_processes import begin
 from made_tracks import export_as, make_track
 from matplotlib.figure import Figure
 
@@ -124,11 +122,11 @@ def test_a_disk_that_refuses_costs_no_file(
 
 ELSEWHERE = """
 import resource, signal, sys
-sys.path[:0] = {paths!r}
+sys.path[:0] = sys.argv[2:]
 import test_files as tests
 from pathlib import Path
 from torchcss.errors import OutputError
-folder = Path({folder!r})
+folder = Path(sys.argv[1])
 names = [name for name in tests.WRITERS if name != "film.mp4"]
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -142,9 +140,9 @@ for name in names:
     except OutputError:
         pass
 resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
-print("written in spite of the limit:", *written, flush=True)
-sys.stdin.readline()
-print("writing", flush=True)
+tell(written)
+hear()
+tell("writing")
 while True:
     for name in tests.WRITERS:
         tests.WRITERS[name](folder / name)
@@ -157,19 +155,14 @@ def test_a_full_disk_and_a_killed_process_cost_no_file(tmp_path: Path) -> None:
     before = {name: (tmp_path / name).read_bytes() for name in WRITERS}
     here = Path(__file__).resolve()
     paths = [str(path) for path in (here.parent, here.parents[1], here.parents[1] / "scripts")]
-    script = ELSEWHERE.format(paths=paths, folder=str(tmp_path))
-    with subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdin is not None
-        assert process.stdout.readline() == "written in spite of the limit:\n"
-        assert {name: (tmp_path / name).read_bytes() for name in WRITERS} == before
-        process.stdin.write("go\n")
-        process.stdin.flush()
-        assert process.stdout.readline() == "writing\n"
-        time.sleep(0.3)
-        process.send_signal(signal.SIGKILL)
+    begun = begin(ELSEWHERE, str(tmp_path), *paths)
+    assert begun.told.recv() == [], "written in spite of the limit"
+    assert {name: (tmp_path / name).read_bytes() for name in WRITERS} == before
+    begun.told.send("go")
+    assert begun.told.recv() == "writing"
+    time.sleep(0.3)
+    begun.process.kill()
+    begun.end()
     # Whatever was under way: every file is whole, the older one or the newer.
     sizes = {name: len(content) for name, content in before.items()}
     assert {name: (tmp_path / name).stat().st_size for name in WRITERS} == sizes

@@ -173,7 +173,7 @@ def test_a_clip_whose_owners_die_at_one_place_is_failed(
 
 
 DEADLY = """
-import os, signal, sys
+import multiprocessing, os, signal, sys
 from torchcss.app import batch
 
 add = batch._Watch.add
@@ -184,6 +184,10 @@ def add_or_die(watch, frame, picture):
     add(watch, frame, picture)
 
 batch._Watch.add = add_or_die  # in the processes that it starts, too
+# A server that has the package already starts them sooner than each would import it.
+of_kind = multiprocessing.get_context
+multiprocessing.set_forkserver_preload(["torchcss.app.batch"])
+multiprocessing.get_context = lambda _: of_kind("forkserver")
 if __name__ == "__main__":
     sys.exit(batch.main())
 """

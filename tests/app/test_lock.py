@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from threading import Timer
 
 import pytest
+from made_processes import begin
 
 from torchcss.app.claims import Claims
 from torchcss.app.lock import LOCK_NAME, locked
@@ -22,17 +21,9 @@ import sys, time
 from pathlib import Path
 from torchcss.app.lock import locked
 with locked(Path(sys.argv[1])) as claim:
-    print("held", flush=True)
+    tell("held")
     time.sleep(60)
 """
-
-
-def begin(folder: Path) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(folder)], env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
 
 
 def of_another_machine(folder: Path) -> Path:
@@ -44,18 +35,19 @@ def of_another_machine(folder: Path) -> Path:
 
 
 def test_of_three_processes_one_writes_and_two_are_refused_with_one_line(tmp_path: Path) -> None:
-    with begin(tmp_path) as first:
-        assert first.stdout is not None
-        assert first.stdout.readline() == "held\n"
-        with begin(tmp_path) as second:
-            _, errors = second.communicate(timeout=60)
-        with pytest.raises(OutputError) as refused:
-            track_video(tmp_path / "no.mp4", out=tmp_path)
-        owner = f"{socket.gethostname()} process {first.pid}"
-        assert str(refused.value).startswith(f"{tmp_path}: {owner} writes into it")
-        assert "\n" not in str(refused.value)
-        assert f"{owner} writes into it" in errors
-        first.kill()
+    first = begin(HOLD, str(tmp_path))
+    assert first.told.recv() == "held"
+    second = begin(HOLD, str(tmp_path))
+    errors = second.told.recv()
+    assert second.end() == 1
+    with pytest.raises(OutputError) as refused:
+        track_video(tmp_path / "no.mp4", out=tmp_path)
+    owner = f"{socket.gethostname()} process {first.process.pid}"
+    assert str(refused.value).startswith(f"{tmp_path}: {owner} writes into it")
+    assert "\n" not in str(refused.value)
+    assert f"{owner} writes into it" in errors
+    first.process.kill()
+    first.end()
     # What a killed process leaves hinders nobody, and nothing stays.
     with locked(tmp_path) as claim:
         assert claim.generation == 2

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from made_processes import begin
 from made_sequences import write_arm
 from PIL import Image
 
@@ -180,17 +179,12 @@ def test_a_killed_process_loses_nothing(
 ) -> None:
     same = [str(clip / word) if "/" in word else word for word in WAYS[kill]]
     script = "import sys; from torchcss.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    environment["OMP_NUM_THREADS"] = str(torch.get_num_threads())
-    with subprocess.Popen(
-        [sys.executable, "-c", script, *command(clip, tmp_path, "--checkpoint-every", "0", *same)],
-        env=environment,
-        stderr=subprocess.DEVNULL,
-    ) as process:
-        while not (tmp_path / "checkpoint.npz").exists() and process.poll() is None:
-            time.sleep(0.01)
-        process.send_signal(kill)
-        ended = process.wait()
+    process, _ = begun = begin(script, *command(clip, tmp_path, "--checkpoint-every", "0", *same))
+    while not (tmp_path / "checkpoint.npz").exists() and process.is_alive():
+        time.sleep(0.01)
+    if process.is_alive():
+        os.kill(process.pid or 0, kill)
+    ended = begun.end()
     assert ended in ({-signal.SIGKILL} if kill is signal.SIGKILL else {143, 0})
     assert cli.main(command(clip, tmp_path, "--resume", *same)) == 0
     assert_same_run((whole if same else filmed).folder, tmp_path)

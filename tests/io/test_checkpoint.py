@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_processes import begin
 
 from torchcss.errors import OutputError, TrackFileError
 from torchcss.io.checkpoint import (
@@ -92,7 +89,7 @@ for n in range(1, 100000):
                              torch.zeros(1, 1, 3)))
     writer.save()
     write_checkpoint(folder, Checkpoint(n, {"a": n * one}))
-    print(n, flush=True)
+    tell(n)
 """
 
 
@@ -100,13 +97,11 @@ def test_killed_at_any_moment_a_complete_pair_is_left(tmp_path: Path):
     from torchcss.io.run import Run
 
     for trial in range(4):
-        with subprocess.Popen(
-            [sys.executable, "-c", PROGRAMME, str(tmp_path)], stdout=subprocess.PIPE
-        ) as process:
-            assert process.stdout is not None
-            for _ in range(3 + 5 * trial):
-                process.stdout.readline()
-            os.kill(process.pid, signal.SIGKILL)
+        begun = begin(PROGRAMME, str(tmp_path))
+        for _ in range(3 + 5 * trial):
+            begun.told.recv()
+        begun.process.kill()
+        begun.end()
         run = Run.open(tmp_path)
         assert run.checkpoint is not None
         count = run.checkpoint.num_frames

@@ -8,8 +8,6 @@ import json
 import os
 import resource
 import signal
-import subprocess
-import sys
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -20,6 +18,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from made_processes import begin
 
 from torchcss import files as atomic
 from torchcss.errors import OutputError, ShapeError, TrackFileError
@@ -248,8 +247,7 @@ def test_killed_in_mid_write_keeps_the_old_file(tmp_path: Path) -> None:
         "    partial.write_bytes(b'half')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    repository = Path(__file__).resolve().parents[2]
-    subprocess.run([sys.executable, "-c", programme, str(path)], cwd=repository, check=False)
+    assert begin(programme, str(path)).end() == -signal.SIGKILL
     assert path.read_bytes() == before
 
 

@@ -10,6 +10,7 @@ from types import ModuleType
 import pytest
 
 from torchcss.errors import ConfigurationError
+from torchcss.studies.demo import CLIP
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "compare_versions.py"
 
@@ -20,8 +21,12 @@ def is_repository() -> bool:
 
 
 @pytest.mark.skipif(not is_repository(), reason="this is no git repository")
-def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
+def test_small_mode(script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "versions.json"
+    # Each of four processes would search for a first pose, for seconds.
+    arm = [*script.clips(script.Config(against="HEAD", frames=2))["arm"], "--samples", "4"]
+    given = {"arm": [*arm, "--init", str(CLIP / "body.npz")]}
+    monkeypatch.setattr(script, "clips", lambda config: given)
     report = script.main(script.Config(against="HEAD", frames=2, repeats=1, two=True, out=out))
     assert list(report["rows"]) == ["arm: other", "arm: this", "arm: two threads"]
     for row in report["rows"].values():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -237,16 +237,21 @@ def test_other_units_are_refused(script: ModuleType, joints: np.ndarray, tmp_pat
         script.main(script.Config(track=track, reference=reference))
 
 
-def test_command_line(joints: np.ndarray, tmp_path: Path) -> None:
+def test_command_line(
+    joints: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     track = write_track(tmp_path / "run", joints[:, None], LIMB_JOINTS)
     reference = write_reference(tmp_path / "r.npz", joints, list(LIMB_JOINTS))
-    command = [sys.executable, str(SCRIPT), str(track), str(reference), "--joints"]
-    run = subprocess.run([*command, "l_wrist", "l_knee", "r_ankle"], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    assert "r_ankle" in run.stdout
-    run = subprocess.run([*command, "nose"], capture_output=True, text=True)
-    assert run.returncode == 2
-    assert run.stderr.startswith("error: no common joints")
+    command = [str(SCRIPT), str(track), str(reference), "--joints"]
+    monkeypatch.setattr(sys, "argv", [*command, "l_wrist", "l_knee", "r_ankle"])
+    runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert "r_ankle" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [*command, "nose"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("error: no common joints")
 
 
 def test_real_reference(script: ModuleType, shared_data: Path, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -120,11 +120,15 @@ def test_bad_input(
     assert not (tmp_path / "motion.npz").exists()
 
 
-def test_command_line(tmp_path: Path) -> None:
+def test_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "motion.bvh"
     path.write_text("HIERARCHY\nROOT Hips\n{\n")
-    command = [sys.executable, str(SCRIPTS / "retarget.py"), str(path), "--out"]
-    run = subprocess.run([*command, str(tmp_path / "m.npz")], capture_output=True, text=True)
-    assert run.returncode == 2
+    script = str(SCRIPTS / "retarget.py")
+    monkeypatch.setattr(sys, "argv", [script, str(path), "--out", str(tmp_path / "m.npz")])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(script, run_name="__main__")
+    assert ended.value.code == 2
     place = f"error: {path}: line 3: expected OFFSET, found 'the end of the file'"
-    assert run.stderr == f"{place}; get a complete copy\n"
+    assert capsys.readouterr().err == f"{place}; get a complete copy\n"

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import subprocess
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_processes import begin
 from made_sequences import rendered_arm
 from made_sessions import INTERVAL, seen_by, start_at
 
@@ -75,12 +73,9 @@ def test_another_process_goes_on_bit_for_bit(tmp_path: Path, name: str) -> None:
     for _ in session.track(frames[half:]):
         pass
     whole = state_tensors(session.checkpoint())
-    here = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*here, *filter(None, sys.path)])}
-    environment["OMP_NUM_THREADS"] = str(torch.get_num_threads())
-    script = "import sys, test_checkpoint; test_checkpoint.go_on(*sys.argv[1:])"
-    command = [sys.executable, "-c", script, str(tmp_path), name]
-    subprocess.run(command, env=environment, check=True)
+    here, *rest = str(Path(__file__).parent), str(tmp_path), name
+    script = "import sys; sys.path.insert(0, sys.argv[1]); import test_checkpoint as tests"
+    assert begin(f"{script}; tests.go_on(*sys.argv[2:])", here, *rest).end() == 0
     resumed = read_checkpoint(tmp_path)
     assert resumed is not None
     assert set(resumed.tensors) == set(whole)

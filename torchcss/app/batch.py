@@ -485,7 +485,8 @@ def work(job: Job) -> None:
             # The pass may take long; others go on meanwhile.
             if job.is_left(clip) and (claim := job.claims.take(clip.name)) is not None:
                 track_claimed(job, clip, claim)
-        time.sleep(_POLL_S)  # others have what is left; one of them may die
+        if any(job.is_left(clip) for clip in left):
+            time.sleep(_POLL_S)  # others have what is left; one of them may die
 
 
 class TakenOver(Exception):
