@@ -15,6 +15,7 @@ import pytest
 import torch
 from made_costs import changed, make_full_cost, printed_cost, random_states
 from made_engines import NATS, RELATIVE, assert_close, awkward_states, colours_of
+from made_processes import begin
 from torch import Tensor
 
 from torchcss.body.shape import with_shape
@@ -220,14 +221,16 @@ x = random_states(cost.body, 4, generator=torch.Generator().manual_seed(0))
 value = cost.value(x)
 if os.fork() == 0:
     os._exit(0 if torch.equal(cost.value(x), value) else 1)
-print(os.waitstatus_to_exitcode(os.wait()[1]))
+tell(os.waitstatus_to_exitcode(os.wait()[1]))
 """
 
 
 @pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
 @pytest.mark.skipif(sys.platform == "win32", reason="no forks")
 def test_a_fork_has_threads_of_its_own() -> None:
-    assert said(FORK) == "0\n"
+    begun = begin(FORK)
+    assert begun.told.recv() == 0
+    assert begun.end() == 0
 
 
 def test_an_index_out_of_range_is_refused() -> None:

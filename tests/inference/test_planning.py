@@ -12,6 +12,7 @@ from pathlib import Path
 import problems
 import pytest
 import torch
+from made_processes import begin
 from torch import Tensor
 
 from torchcss.inference import trust_region
@@ -204,10 +205,14 @@ print(NEWTON.minimise(cost, x0[:12], bounds).cost.nan_to_num(posinf=0.0).sum().i
 """
 
 BITS = """
-import torch
-from test_planning import NEWTON, made
-found = NEWTON.minimise(*made("body34", torch.Generator().manual_seed(0)))
-print(found.cost.numpy().tobytes().hex())
+import sys, torch
+sys.path[:0] = sys.argv[1:]
+from test_planning import NEWTON, Indefinite, problems, randn
+generator = torch.Generator().manual_seed(0)
+# As large as a body, of no kernels but those of the step, which are compiled.
+a, x = randn(34, 34, generator=generator), randn(40, 34, generator=generator)
+found = NEWTON.minimise(Indefinite(a + a.T, a[0]), x, problems.box(34, -1, 1))
+tell([part.numpy().tobytes() for part in found])
 """
 
 
@@ -230,5 +235,10 @@ def test_no_index_is_out_of_range(generator):
 
 
 def test_a_process_that_compiles_finds_what_one_with_a_cache_finds(tmp_path):
-    first, second = (in_a_process(BITS, TORCHCSS_CACHE=str(tmp_path)) for _ in range(2))
-    assert first == second
+    found = []
+    for _ in range(2):
+        begun = begin(BITS, str(Path(__file__).parent), TORCHCSS_CACHE=str(tmp_path))
+        found.append(begun.told.recv())
+        assert begun.end() == 0
+    assert list(tmp_path.rglob("*advance*")), "the first process has compiled"
+    assert found[0] == found[1]

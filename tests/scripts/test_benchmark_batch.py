@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from made_processes import SERVED
 
 from torchcss.errors import ConfigurationError
 
@@ -30,7 +31,11 @@ def test_a_folder_without_clips_is_refused(script: ModuleType, tmp_path: Path) -
         script.main(script.Config(data=tmp_path))
 
 
-def test_processes_of_a_batch(script: ModuleType, tmp_path: Path) -> None:
+def test_processes_of_a_batch(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The processes that start the batches; a batch starts its own.
+    monkeypatch.setattr(script.multiprocessing, "get_context", lambda _: SERVED)
     settings = replace(script.SETTINGS, samples=5, modes=2, working_size=160)
     out = tmp_path / "J.json"
     script.main(script.Config(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import learn_weights as script
@@ -14,6 +16,14 @@ from torchcss.tracking.settings import Settings
 SMALL = script.Config(frames=2, epochs=1, starts=1, track=True,
     begin={"contour": 0.1, "region": 0.1},
     tracking=Settings(body="arm8", keypoints_use="first", working_size=160))  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def rendered_once() -> Iterator[None]:
+    """The same films for all tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(script, "load", cache(script.load))
+        yield
 
 
 def test_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
