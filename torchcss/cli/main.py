@@ -36,6 +36,7 @@ from torchcss.cli.track import Track
 from torchcss.cli.undistort import Undistort
 from torchcss.cli.view import Plot, Report, View
 from torchcss.errors import OutputError, TorchcssError
+from torchcss.files import one_line
 from torchcss.studies.demo import DEMO_SETTINGS, run_demo
 from torchcss.types import frozen
 
@@ -114,6 +115,12 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:
         # A disk that fills up or goes away in mid-write.
         print(f"torchcss: {OutputError(str(error))}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:  # the latter is torch's
+        if not isinstance(error, MemoryError) and "memory" not in str(error):
+            raise
+        told = f"memory is short, ask for less ({one_line(error)}){_LEFT.get(type(verb), '')}"
+        print(f"torchcss: {told}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interruption:
         print(f"torchcss: interrupted{_LEFT.get(type(verb), '')}", file=sys.stderr)
