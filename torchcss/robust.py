@@ -33,7 +33,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.errors import check_positive
+from torchcss.errors import check_positive, check_range
 from torchcss.types import Numbers, frozen
 
 
@@ -65,6 +65,7 @@ class RobustPotential(ABC):
 
     def __post_init__(self) -> None:
         check_positive(self, "nu", "sigma", finite=True)
+        check_range(self, "sigma", most=1e100, hint=", whose square is a number too")
 
     @abstractmethod
     def __call__(self, s: Numbers) -> RobustValue:

@@ -78,6 +78,12 @@ SPOILED = {
     "too few joints": lambda f: spoil_keypoints(
         f, confidence=np.tile([1.0, 1.0, 0.0, 0.0], (3, 1))
     ),
+    "keypoints of no noise": lambda f: spoil_keypoints(f, relative_noise=1e-300),
+    "keypoints of any noise": lambda f: spoil_keypoints(f, relative_noise=1e300),
+    "camera of no angle": lambda f: spoil_camera(f, K=[[1e308, 0, 31], [0, 1e308, 23], [0, 0, 1]]),
+    "names in Latin-1": lambda f: spoil_keypoints(
+        f, joint_names=np.array([b"\xff", b"\xfe", b"a", b"b"])
+    ),
     "out is a file": lambda f: (f / "out").write_text("in the way"),
 }
 
@@ -110,6 +116,25 @@ def test_one_clear_line(files: Path, what: str, capsys: pytest.CaptureFixture[st
 def test_bad_options(files: Path, options: tuple[str, ...], capsys: pytest.CaptureFixture[str]):
     assert track(files, *options) == 2
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("torchcss: ")
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
+)
+def test_memory_that_is_short_is_told(
+    files: Path,
+    error: Exception,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli.Track, "run", fail)
+    assert track(files, "--samples", str(10**12)) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("torchcss: memory is short, ask for less (")
+    assert told.endswith(cli._LEFT[cli.Track] + "\n")
 
 
 def test_start_is_checked_before_the_offset(files: Path, capsys: pytest.CaptureFixture[str]):

@@ -40,7 +40,7 @@ from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.targets import PointTargets
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import ConfigurationError, check_positive, check_range
+from torchcss.errors import ConfigurationError, KeypointError, check_positive, check_range
 from torchcss.inference.mixture import GaussianMixture, cheapest_first, distinct_modes
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -158,6 +158,9 @@ def multi_start_fits(
 
     Returns:
         The ends of all descents, in no order and with duplicates (see `distinct_modes`).
+
+    Raises:
+        KeypointError: If no pose has a finite cost.
     """
     body = cost.body
     bounds = search.bounds(body)
@@ -187,7 +190,13 @@ def multi_start_fits(
             samples = proposal.sample(mixture, search.num_samples, bounds, generator=generator)
             starts.append(samples.x)
     x = descend_widened(cost, torch.cat(starts), bounds, ((_MIDDLE, 10),) if search.anneal else ())
-    return optimise(cost, x, bounds, search.max_steps)
+    fits = optimise(cost, x, bounds, search.max_steps)
+    if not bool(fits.cost.isfinite().any()):
+        raise KeypointError(
+            "no pose has a finite cost: expected keypoints, their noise and the camera's focal "
+            "length in pixels of this picture"
+        )
+    return fits
 
 
 def optimise(

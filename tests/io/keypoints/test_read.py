@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from torchcss.errors import KeypointError
+from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.joint_names import ALIASES, JOINT_NAMES
 from torchcss.types import Keypoints
@@ -490,6 +491,11 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
     (tmp_path / "b.json").write_bytes((tmp_path / "b.npz").read_bytes())
     with pytest.raises(KeypointError, match="not a JSON file"):
         read(tmp_path / "b.json")
+
+
+def test_points_that_mean_something_else_are_left(tmp_path: Path) -> None:
+    keypoints = read(path := write_npz(tmp_path / "a.npz", moving(), points=np.zeros((2, 2))))
+    assert read_points(path, keypoints) is keypoints
 
 
 @pytest.mark.parametrize(

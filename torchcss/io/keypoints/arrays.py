@@ -130,13 +130,15 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     if path.suffix.lower() != ".npz" or not path.is_file():
         return keypoints
     arrays = load_arrays(path, KeypointError, MOST_BYTES)
-    if "points" not in arrays:
-        return keypoints
-    places = torch.as_tensor(arrays["keypoints"]).to(keypoints.positions)
-    column = [list(arrays["joint_names"]).index(name) for name in keypoints.names]
+    names, nothing = list(arrays.get("joint_names", ())), np.zeros(0)
+    pixels, points = arrays.get("keypoints", nothing), arrays.get("points", nothing)
+    if points.shape != (*pixels.shape[:3], 3) or not {*keypoints.names} <= {*names}:
+        return keypoints  # somebody else's points
+    places = torch.as_tensor(pixels).to(keypoints.positions)
+    column = [names.index(name) for name in keypoints.names]
     gap = (places[:, :, column] - keypoints.positions[:, None]).norm(dim=-1)
     gap = torch.where(keypoints.confidence[:, None] > 0, gap, 0.0).nan_to_num(torch.inf).sum(-1)
-    points = torch.as_tensor(arrays["points"]).to(places)[:, :, column]
+    points = torch.as_tensor(points).to(places)[:, :, column]
     return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
 
 
@@ -245,4 +247,5 @@ def _names(names: np.ndarray | None, num_joints: int) -> Names | None:
         return None
     if names.shape != (num_joints,) or names.dtype.kind not in "SU":
         raise _unfit("joint_names", names, f"{num_joints} names")
-    return tuple(str(name) for name in names.astype(str))
+    return tuple(each.decode(errors="replace") if isinstance(each, bytes) else each
+                 for each in names.tolist())  # fmt: skip
