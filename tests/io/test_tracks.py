@@ -363,6 +363,40 @@ def test_nan_is_refused(tmp_path: Path) -> None:
         load_track(tmp_path / "b.npz")
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("covariance", np.inf, "covariance holds infinity"),
+        ("times", -np.inf, "times holds infinity"),
+        ("frames", -1, "frames: expected numbers from 0 in rising order"),
+        ("frames", 0, "frames: expected numbers from 0 in rising order"),
+    ],
+)
+def test_what_no_tracker_writes_is_refused(
+    tmp_path: Path, name: str, value: float, words: str
+) -> None:
+    write_track(tmp_path / "track.npz")
+    arrays = arrays_of(tmp_path / "track.npz")
+    arrays[name].flat[-1] = value
+    np.savez(tmp_path / "b.npz", **arrays)
+    with pytest.raises(TrackFileError, match=words):
+        load_track(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("notes", 3), ("events", {}), ("events", [3]), ("events", [{"event": "lost"}]),
+        ("optimiser_status", []), ("cameras", 3),
+    ],
+)  # fmt: skip
+def test_a_summary_that_somebody_changed(tmp_path: Path, name: str, value: object) -> None:
+    path = tmp_path / "summary.json"
+    path.write_text(json.dumps({"ended": "complete", name: value}))
+    with pytest.raises(TrackFileError, match=f"{name}: expected"):
+        read_summary(path)
+
+
 def test_the_power_of_the_covariances_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "track.npz"
     writer = TrackWriter(path, Track.empty(("a",), ("b",))._replace(likelihood_power=0.1))

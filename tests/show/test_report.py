@@ -120,7 +120,10 @@ def test_the_page_says_which_tracker_it_was(folder: Path) -> None:
     )
     assert told["Told lost"] == "not watched for, without recovery"
     assert told["Keypoints"].endswith("joints.npz, in the first frame alone")
-    ours = facts_of(folder, {"settings": {"preset": "css"}, "events": [{"event": "lost"}]})
+    ours = facts_of(
+        folder,
+        {"settings": {"preset": "css"}, "events": [{"event": "lost", "frame": 0, "time_s": 0.0}]},
+    )
     assert ours["Told lost"] == "1 time"
     assert ours["Keypoints"].endswith("joints.npz")
     assert facts_of(folder, {"settings": {"preset": "css_figure_6", "recovery": True}})[

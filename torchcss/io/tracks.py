@@ -59,6 +59,7 @@ from torchcss.files import (
     load_json,
     refusing,
     save_arrays,
+    unexpected,
     write_text,
 )
 from torchcss.io.track_body import body_from_plain, body_to_plain
@@ -413,12 +414,18 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
                 f"{path}: {name}: expected shape {list(shape)}, "
                 f"got {array.dtype} {list(array.shape)}"
             )
-        if array.dtype.kind == "f" and np.isnan(array).any():
-            raise TrackFileError(f"{path}: {name} holds NaN; the file was not written by torchcss")
+        odd = np.isnan if name in ("log_weight", "cost") else lambda array: ~np.isfinite(array)
+        if array.dtype.kind == "f" and odd(array).any():
+            what = "NaN" if np.isnan(array).any() else "infinity"
+            raise TrackFileError(
+                f"{path}: {name} holds {what}; the file was not written by torchcss"
+            )
         if array.dtype.kind == "U":
             values[name] = tuple(str(entry) for entry in array)
         else:
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
+    if (values["frames"] < 0).any() or (np.diff(values["frames"]) <= 0).any():
+        raise TrackFileError(f"{path}: frames: expected numbers from 0 in rising order")
     if (empty := (values["log_weight"] == -np.inf).all(1)).any():
         raise TrackFileError(f"{path}: row {empty.argmax()}: no mode; expected one or more a frame")
     power = float(values.pop(_POWER_KEY))
@@ -462,6 +469,15 @@ def write_summary(path: StrPath, summary: Mapping[str, Any]) -> None:
     write_text(path, text + "\n")
 
 
+_KINDS = {
+    **dict.fromkeys(("events", "notes", "other_views", "changed_beside_preset"), list),
+    **dict.fromkeys(("optimiser_status", "settings", "cameras"), dict),
+}
+"""What entries of a summary are that somebody reads."""
+
+_EVENT = {"event", "frame", "time_s"}
+
+
 def read_summary(path: StrPath) -> dict[str, Any]:
     """Read a `summary.json`, or the one in a folder.
 
@@ -472,6 +488,13 @@ def read_summary(path: StrPath) -> dict[str, Any]:
     summary = load_json(path, TrackFileError)
     if not isinstance(summary, dict):
         raise TrackFileError(f"{path}: not a summary; expected a JSON object")
+    for name, kind in _KINDS.items():
+        if not isinstance(found := summary.get(name, kind()), kind):
+            what = "a list" if kind is list else "an object"
+            raise unexpected(TrackFileError, f"{path}: {name}", what, found)
+    for event in summary.get("events", []):
+        if not isinstance(event, dict) or not event.keys() >= _EVENT:
+            raise unexpected(TrackFileError, f"{path}: events", f"{sorted(_EVENT)} of each", event)
     return summary
 
 

@@ -149,7 +149,8 @@ def _film(run: Run, *, anew: bool) -> str:
     count = len(run.track.frames)
     rows = range(0, count, math.ceil(count / MOST_PICTURES))
     times = run.track.times[rows]
-    rate = (len(rows) - 1) / float(times[-1] - times[0]) if len(rows) > 1 else 1.0
+    span = float(times[-1] - times[0])
+    rate = (len(rows) - 1) / span if span > 0 else 1.0
     still, missing = BytesIO(), without_pictures(run)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
