@@ -53,21 +53,23 @@ def session_of(film: SyntheticSequence, seed: int, **settings: Any) -> TrackingS
     return session_at(chosen, deepcopy(body), film.states[0], view)
 
 
-def both_ways(
-    films: list[SyntheticSequence], **settings: Any
-) -> tuple[list[list[Posterior]], list[list[Posterior]]]:
-    """What is found one after the other, and side by side."""
-    alone = [
+def one_by_one(films: list[SyntheticSequence], **settings: Any) -> list[list[Posterior]]:
+    """What is found one after the other."""
+    return [
         list(session_of(film, seed, **settings).track(film.frames))
         for seed, film in enumerate(films)
     ]
+
+
+def side_by_side(films: list[SyntheticSequence], **settings: Any) -> list[list[Posterior]]:
+    """What is found of all at once."""
     sessions = [session_of(film, seed, **settings) for seed, film in enumerate(films)]
     beside: list[list[Posterior]] = [[] for _ in films]
     pairs = [(session, film.frames) for session, film in zip(sessions, films, strict=True)]
     for moment in torchcss.track_batch(pairs):
         for own, posterior in zip(beside, moment, strict=True):
             own += [] if posterior is None else [posterior]
-    return alone, beside
+    return beside
 
 
 @pytest.mark.parametrize(
@@ -93,7 +95,8 @@ def both_ways(
 def test_the_results_are_those_of_one_after_the_other(
     films: list[SyntheticSequence], engine: str, preset: str
 ) -> None:
-    alone, beside = both_ways(films, preset=preset, engine=engine)
+    given = {"preset": preset, "engine": engine}
+    alone, beside = one_by_one(films, **given), side_by_side(films, **given)
     for one, other in zip(alone, beside, strict=True):
         assert [p.frame.index for p in one] == [p.frame.index for p in other]
         for a, b in zip(one, other, strict=True):
@@ -131,7 +134,7 @@ def test_samples_of_all_are_one_evaluation(
         return model(cost, x)
 
     monkeypatch.setattr(TrackingCost, "local_model", noted)
-    both_ways(films, engine="eager")
+    side_by_side(films, engine="eager")
     assert [0, 1] in seen
     # The longer film goes on by itself, and a search that takes longer does.
     assert set(sizes) == {1, 2}

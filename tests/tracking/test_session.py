@@ -762,13 +762,16 @@ def test_even_times_are_as_if_there_were_none(name: str):
     """To the bit, also where a container has rounded them to milliseconds, or they do not rise."""
     sequence = rendered_arm(0, 5)
     rounded = [round(1000 * i / 25.3) / 1000 for i in range(5)]
+    first, view = start_at(sequence.body, sequence.states[0]), seen_by(sequence.camera)
+
+    def tracked(frames: Iterable[Any]) -> list[Posterior]:
+        session = TrackingSession(TIMED[name], first, view, frame_interval=1 / 25.3)
+        return list(session.track(frames))
+
+    plain = tracked(sequence.frames)
     for times in (rounded, [0.0] * 5):
-        first, view = start_at(sequence.body, sequence.states[0]), seen_by(sequence.camera)
-        plain, timed = (
-            TrackingSession(TIMED[name], first, view, frame_interval=1 / 25.3) for _ in range(2)
-        )
-        given = [Frame(i, times[i], image) for i, image in enumerate(sequence.frames)]
-        for one, other in zip(plain.track(sequence.frames), timed.track(given), strict=True):
+        timed = tracked(Frame(i, times[i], image) for i, image in enumerate(sequence.frames))
+        for one, other in zip(plain, timed, strict=True):
             assert torch.equal(one.state.mixture.mean, other.state.mixture.mean)
             assert torch.equal(one.covariance, other.covariance)
             assert torch.equal(one.state.velocity, other.state.velocity)
