@@ -35,7 +35,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.io.tracks import read_summary
 from torchcss.show.style import save_figure
 from torchcss.studies.comparison import Start, TrackerRun, find_start, track_together
-from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
+from torchcss.studies.evaluation import Thresholds, compared_joints, over_seeds, summarise
 from torchcss.studies.metrics import spread
 from torchcss.studies.plots import error_curves, failure_figure
 from torchcss.studies.sequences import RecordedSequence, read_sequence
@@ -121,7 +121,9 @@ def main(config: Config) -> dict[str, Any]:
                 starts[each.seed] = find_start(sequence, each, start=config.start)
         together = [(each, starts[each.seed]) for each in settings]
         for run in follow(config, sequence, together, thresholds):
-            runs.append(entry_of(run, thresholds, 1 / sequence.frame_rate))
+            body = together[run.number][1].first.body
+            entry = entry_of(run, thresholds, 1 / sequence.frame_rate)
+            runs.append(entry | {"joints": compared_joints(sequence, body)})
             report = write(config, study, runs)
     trackers_table(report["by_tracker"], sequence.name).print()
     weights_table(report["apart_weight"]).print()

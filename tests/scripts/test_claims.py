@@ -13,6 +13,7 @@ import pytest
 from made_sequences import write_arm
 
 from torchcss.errors import ConfigurationError
+from torchcss.studies.sequences import read_sequence
 
 
 def run_of(preset: str, seed: int, lost_s: float | None = None, **entries: Any) -> dict[str, Any]:
@@ -108,7 +109,8 @@ def test_claims_are_judged(script: ModuleType, tmp_path: Path) -> None:
 def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_path: Path) -> None:
     folder = tmp_path / "arm"
     write_arm(folder, 4)
-    name, depth = script.depth_share(folder)
+    sequence = read_sequence(folder)
+    depth = script.depth_share(sequence)
     assert depth.shape == (3,)
     assert ((depth >= 0) & (depth <= 1)).all()
     weight = [0.0, *np.where(depth[:2] > np.median(depth[:2]), 0.9, 0.1).tolist()]
@@ -120,14 +122,55 @@ def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_pat
         "because the sequence is not given", "not tested",
     )  # fmt: skip
     evidence = script.read_evidence(script.Config(failures=(path,), sequences=(folder,)))
-    assert name in evidence.depth
-    seen = script.multimodal(replace(evidence, depth={"arm": depth}), "arm", "ijrr_css")
+    assert set(evidence.sequences) == {sequence.name}
+    evidence = replace(evidence, sequences={"arm": sequence})
+    seen = script.multimodal(evidence, "arm", "ijrr_css")
     assert seen.holds
     assert "0.90 in the half" in seen.words
     assert not script.mostly_multimodal(evidence, "arm", "ijrr_css").holds
     run["per_frame"]["apart_weight"] = [0.0, 0.5, 0.5]
     evidence.runs["arm"]["ijrr_css"][:] = [run]
     assert script.mostly_multimodal(evidence, "arm", "ijrr_css").holds
+
+
+def test_turns_are_followed_or_taken_for_others(script: ModuleType, tmp_path: Path) -> None:
+    folder = tmp_path / "arm"
+    write_arm(folder, 4)
+    recorded = read_sequence(folder)
+    names = ("r_shoulder", "r_elbow", "r_wrist", "l_shoulder")
+    turn = np.radians([0, 10, 20, 30])
+
+    def arm(upper: np.ndarray, bent: np.ndarray, trunk: np.ndarray) -> np.ndarray:
+        """An arm in the horizontal plane, turned in depth, and the other shoulder."""
+        elbow = np.stack([np.cos(upper), 0 * upper, np.sin(upper)], -1)
+        wrist = elbow + np.stack([np.cos(upper + bent), 0 * upper, np.sin(upper + bent)], -1)
+        other = np.stack([np.cos(trunk), 0 * upper, np.sin(trunk)], -1)
+        return np.stack([0 * elbow, elbow, wrist, other], 1)
+
+    rotation = recorded.camera.R_camera_world.numpy()
+    true = arm(turn, 0 * turn, turn) @ rotation
+    sequence = recorded._replace(joint_names=names, joints_world=true, truth=None)
+    held = arm(turn / 2, turn, 0.9 * turn) @ rotation
+    run = run_of("ijrr_single_limits", 0, joints=names[1:])
+    run["per_frame"] = {
+        "time_s": [0, 1, 2, 3], "frame": [0, 1, 2, 3],
+        "joints_mm": (1000 * held[:, 1:]).tolist(),
+    }  # fmt: skip
+    path = report_of([run], tmp_path / "arm.json")
+    evidence = script.read_evidence(script.Config(failures=(path,)))
+    evidence = replace(evidence, sequences={"arm": sequence})
+    seen = script.elbow_for_shoulder(evidence, "arm", "ijrr_single_limits")
+    words = "the upper arm follows 50 % of its turn in depth, the elbow is 15 degrees off"
+    assert seen == (words, True)
+    seen = script.trunk_turns_less(evidence, "arm", "ijrr_single_limits")
+    assert seen == ("the shoulders follow 90 % of their turn", False)
+    run = evidence.runs["arm"]["ijrr_single_limits"][0]
+    run["lost_s"] = 0.0
+    with pytest.raises(script.Missing, match="is lost before anything turns by 10 degrees"):
+        script.trunk_turns_less(evidence, "arm", "ijrr_single_limits")
+    del run["per_frame"]["joints_mm"]
+    with pytest.raises(script.Missing, match="has no joints"):
+        script.trunk_turns_less(evidence, "arm", "ijrr_single_limits")
 
 
 def test_weights_help_where_the_error_is_less(script: ModuleType, tmp_path: Path) -> None:

@@ -58,6 +58,8 @@ def test_small_mode_and_resume(
     for run in report["runs"]:
         assert run["ended"] == "complete"
         assert run["num_frames"] == len(run["per_frame"]["time_s"]) == 3
+        assert run["per_frame"]["frame"] == [0, 1, 2]
+        assert np.shape(run["per_frame"]["joints_mm"]) == (3, len(run["joints"]), 3)
     rows = report["by_tracker"]
     assert set(rows) == set(presets)
     row = rows["ijrr_robust_single"]

@@ -442,6 +442,7 @@ def summarise(
             for stage in measures[0].seconds
         },
         "per_frame": {
+            "frame": every("frame"),
             "time_s": times,
             "failed": every("failed"),
             "root_aligned_mm": [_mean(m.root_aligned_mm[0]) for m in measures],
@@ -449,6 +450,7 @@ def summarise(
             **{name: every(name) for name in ("overlap", "along_mm", "across_mm", "apart_weight")},
             "penetration_mm": [1000 * float(m.penetration_m[0]) for m in measures],
             "at_bound": every("at_bound"),
+            "joints_mm": [np.rint(1000 * m.joints_m).tolist() for m in measures],
         },
     }
 
