@@ -290,6 +290,25 @@ def test_what_is_seen_along_lines(script: ModuleType, tmp_path: Path) -> None:
     assert "arm, frame 15: 9.0" in words
 
 
+def test_spurious_minima_are_compared_by_frame(script: ModuleType, tmp_path: Path) -> None:
+    path = tmp_path / "minima.json"
+    gains = {("quadratic", 0.0): (0, 0, 0), ("Lorentzian", 0.0): (1, 2, 3),
+             ("Lorentzian", 0.3): (1, 2, 4)}  # fmt: skip
+    rows = [
+        {"body": "arm8", "terms": "contour", "potential": potential, "k": k,
+         "fewer_by_frame": {f"frame {i}": gain for i, gain in enumerate(own)}}
+        for (potential, k), own in gains.items()
+    ]  # fmt: skip
+    path.write_text(json.dumps({"rows": rows}))
+    seen = verdicts(script.main(script.Config(minima=path)))
+    assert seen["robust errors leave fewer spurious minima than least squares"] == (
+        "arm8: 2.0 fewer a line (standard error 0.6)", "holds",
+    )  # fmt: skip
+    assert seen["motion boundaries with k of 0.2 to 0.4 work: fewer still with 0.3"] == (
+        "arm8: 0.3 fewer a line (standard error 0.3)", "does not hold",
+    )  # fmt: skip
+
+
 def test_first_poses_without_constraints(script: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "first.json"
     errors = {"full": 60.0, "without limits": 75.0, "no prior on lengths": 58.0}
