@@ -118,7 +118,7 @@ def test_a_video_outside_the_run_is_told(
     save_track(out / TRACK_NAME, track._replace(cameras=(RecordedCamera(camera, files),)))
     for more, is_told in ([], True), (["--video", str(video)], False):
         assert cli.main(["report", str(out), *more]) == 0
-        assert (f"outside its folder the run names {video}" in capsys.readouterr().err) == is_told
+        assert (f"reading {video}, which the run names" in capsys.readouterr().err) == is_told
     (out / video.name).write_bytes(video.read_bytes())
     video.unlink()
     assert cli.main(["report", str(out)]) == 0

@@ -50,8 +50,7 @@ def tell_outside(run: Run, paths: Iterable[Path | None], given: Sequence[object]
     for path in dict.fromkeys(paths):
         is_own = path is None or path.resolve().is_relative_to(run.folder.resolve())
         if path is not None and not is_own and path not in given and path.exists():
-            told = f"outside its folder the run names {path}; another counts first if it is given"
-            print(told, file=sys.stderr)
+            print(f"reading {path}, which the run names (outside its folder)", file=sys.stderr)
 
 
 @frozen
