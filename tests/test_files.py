@@ -216,3 +216,8 @@ def test_arrays_are_written_under_the_name_that_was_asked_for(tmp_path: Path) ->
         torchcss.files.save_arrays(tmp_path / name, {"a": torch.ones(2)})
         assert list(torchcss.files.load_arrays(tmp_path / name, OutputError)) == ["a"]
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_names_that_are_not_utf_8_are_written_escaped(tmp_path: Path) -> None:
+    torchcss.files.write_text(tmp_path / "a.html", "<p>\udcff.mp4</p>")
+    assert (tmp_path / "a.html").read_text(encoding="utf-8") == "<p>\\udcff.mp4</p>"

@@ -161,11 +161,13 @@ def _widened(rows: np.ndarray, width: int, fill: float) -> np.ndarray:
 def write_text(path: Path, text: str) -> None:
     r"""Write a text file in UTF-8 whole or not at all, its lines ended by `\n` everywhere.
 
+    Signs of a file's name that are none of UTF-8, as Linux has them, are written as `\udcff`.
+
     Raises:
         OutputError: If it cannot be written.
     """
     with replace_file(path) as partial:
-        partial.write_text(text, encoding="utf-8", newline="\n")
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace", newline="\n")
 
 
 def temporary_name(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from pathlib import Path
@@ -193,6 +194,15 @@ def test_an_interruption_tells_what_is_left(
     more = {cli.Export: ["--to", "bvh"], cli.Undistort: ["--camera", "b"]}.get(verb, [])
     assert cli.main([verb.__name__.lower(), "a", *more]) == 130
     assert capsys.readouterr().err == f"torchcss: interrupted{told}\n"
+
+
+def test_signs_that_a_terminal_has_not_are_escaped(monkeypatch: pytest.MonkeyPatch):
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(cli.Plot, "run", lambda _: print("\u8996\udcff"))
+    monkeypatch.setattr("sys.stdout", stdout)
+    assert cli.main(["plot", "a"]) == 0
+    stdout.flush()
+    assert stdout.buffer.getvalue().strip() == rb"\u8996\udcff"
 
 
 @pytest.mark.parametrize("verb", ["demo", "track"])

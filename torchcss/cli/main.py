@@ -20,6 +20,7 @@ SIGTERM with 143. What was tracked until then is on disk; `torchcss track ... --
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 
@@ -101,6 +102,8 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit status.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names may have signs that a terminal has not
+        sys.stdout.reconfigure(errors="backslashreplace")
     words = sys.argv[1:] if arguments is None else arguments
     options = [word.partition("=") for word in words]
     words = ["".join((_OLD_NAMES.get(name, name), *value)) for name, *value in options]
