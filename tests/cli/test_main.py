@@ -155,6 +155,15 @@ def test_the_advice_about_fractions_can_be_followed(
     assert "say --normalised zero-one" in capsys.readouterr().err
 
 
+def test_what_is_read_is_not_replaced(files: Path, capsys: pytest.CaptureFixture[str]):
+    (files / "out").mkdir()
+    film = files / "out" / "overlay.mp4"
+    film.write_bytes((files / "video.mp4").read_bytes())
+    assert track(files, "--masks", str(film)) == 2
+    assert f"{film}: a run in this folder replaces it" in capsys.readouterr().err
+    assert film.read_bytes() == (files / "video.mp4").read_bytes()
+
+
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write everywhere")
 def test_unwritable_folder(files: Path, capsys: pytest.CaptureFixture[str]):
     files.chmod(0o500)

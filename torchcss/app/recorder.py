@@ -244,14 +244,14 @@ class Recorder:
         """Remove what belongs to another track, now that there will be one in its place."""
         remove_checkpoint(self.folder)
         for old in sorted(self.folder.iterdir()):
-            if _OF_A_TRACK.fullmatch(old.name):
+            if OF_A_TRACK.fullmatch(old.name):
                 try:
                     old.unlink(missing_ok=True)
                 except OSError as error:
                     raise output_error(old, error) from error
 
 
-_OF_A_TRACK = re.compile(r"smooth\.npz|overlay(_[0-9]+)?\.mp4|(smooth_)?report\.html")
+OF_A_TRACK = re.compile(r"smooth\.npz|overlay(_[0-9]+)?\.mp4|(smooth_)?report\.html")
 """Files that were made of a track."""
 
 

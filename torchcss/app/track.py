@@ -23,12 +23,18 @@ from torchcss.app.detect import DetectOptions, detect_video, is_detected, masks_
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import PERSONS, KnownLens, fitted
 from torchcss.app.lock import locked
-from torchcss.app.recorder import CHECKPOINT_EVERY, Recorder, Sink
+from torchcss.app.recorder import CHECKPOINT_EVERY, OF_A_TRACK, Recorder, Sink
 from torchcss.app.view_files import FrameSelection, OpenView, moments, open_run, open_view
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
-from torchcss.errors import CameraError, ConfigurationError, TrackFileError, check_positive
+from torchcss.errors import (
+    CameraError,
+    ConfigurationError,
+    OutputError,
+    TrackFileError,
+    check_positive,
+)
 from torchcss.files import StrPath, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
@@ -174,6 +180,7 @@ def _begin(
     lock: WorkClaim,
 ) -> Run:
     """Find the first pose, and track from it."""
+    _check_not_replaced(views, out)
     start = selection.start
     generator = torch.Generator().manual_seed(settings.seed)
     eye = views[0].camera.camera.to(dtype=settings.torch_dtype, device=settings.device)
@@ -206,6 +213,16 @@ def _begin(
         lock=lock,
     )
     return _record(recorder, views)
+
+
+def _check_not_replaced(views: Sequence[OpenView], out: Path) -> None:
+    """Refuse a folder in which a file that is read has the name of one that is made of a track."""
+    for files in (view.files for view in views):
+        for path in filter(None, (files.video, files.keypoints, files.masks)):
+            if OF_A_TRACK.fullmatch(path.name) and path.parent.resolve() == out.resolve():
+                raise OutputError(
+                    f"{path}: a run in this folder replaces it; choose another one with --out"
+                )
 
 
 def _size_deviation(settings: Settings, first: Initialisation, num_cameras: int) -> float:
