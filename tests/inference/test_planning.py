@@ -207,11 +207,8 @@ print(NEWTON.minimise(cost, x0[:12], bounds).cost.nan_to_num(posinf=0.0).sum().i
 BITS = """
 import sys, torch
 sys.path[:0] = sys.argv[1:]
-from test_planning import NEWTON, Indefinite, problems, randn
-generator = torch.Generator().manual_seed(0)
-# As large as a body, of no kernels but those of the step, which are compiled.
-a, x = randn(34, 34, generator=generator), randn(40, 34, generator=generator)
-found = NEWTON.minimise(Indefinite(a + a.T, a[0]), x, problems.box(34, -1, 1))
+from test_planning import NEWTON, made
+found = NEWTON.minimise(*made("body34", torch.Generator().manual_seed(0)))
 tell([part.numpy().tobytes() for part in found])
 """
 
