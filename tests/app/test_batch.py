@@ -44,7 +44,7 @@ def test_a_bad_clip_fails_alone_and_is_tried_again_when_it_has_changed(tmp_path:
         tmp_path, {"name": "good", "seed": 3}, {"name": "bad", "video": str(bad)}
     )
     batch = Batch(manifest=manifest, out=tmp_path / "out", settings=SETTINGS)
-    batch.run()
+    assert batch.run() == 1
     told = json.loads((tmp_path / "out" / "batch.json").read_text())
     assert (told["done"], told["failed"]) == (1, 1)
     assert "bad.mp4" in told["clips"]["bad"]["about"]
@@ -58,7 +58,7 @@ def test_a_bad_clip_fails_alone_and_is_tried_again_when_it_has_changed(tmp_path:
     replace(batch, retry_failed=True).run()
     assert failed.stat().st_mtime_ns > before
     shutil.copy(CLIP / "video.mp4", bad)
-    batch.run()
+    assert batch.run() == 0
     assert json.loads((tmp_path / "out" / "batch.json").read_text())["done"] == 2
     assert "bad" in (tmp_path / "out" / "batch.html").read_text()
     assert not list((tmp_path / "out" / ".batch" / "work").iterdir())

@@ -234,3 +234,12 @@ def test_options_of_version_0_1_are_understood(files: Path, option: tuple[str, .
     assert track(files, "--no-overlay", *option) == 0
     settings = json.loads((files / "out" / "summary.json").read_text())["settings"]
     assert settings["likelihood_power"] == 0.3
+
+
+def test_a_batch_of_which_a_clip_fails_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "clips.csv").write_text("video\nnone.mp4\n")
+    arguments = ["batch", str(tmp_path / "clips.csv"), "--out", str(tmp_path / "out")]
+    assert cli.main(arguments) == 1
+    assert "1 failed; see" in capsys.readouterr().out

@@ -132,8 +132,11 @@ class Batch:
                 f"{self.patience}"
             )
 
-    def run(self) -> None:
+    def run(self) -> int:
         """Run the batch; how it ended is in `batch.json` and printed.
+
+        Returns:
+            How many clips failed.
 
         Raises:
             TorchcssError: If the manifest or the folder is of no use. What is wrong with a clip is
@@ -147,6 +150,7 @@ class Batch:
                 else:
                     work(job)
             print(job.report())
+        return sum(state.kind == "failed" for state in job.states().values())
 
     def _with_workers(self, job: Job) -> None:
         """Start processes, and wait for them; for one that died with a clip, another starts."""

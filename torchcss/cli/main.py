@@ -72,7 +72,8 @@ _DESCRIPTION = """Tracks a body with joints through a video, and keeps the poses
 
 `torchcss track VIDEO` needs nothing but a video once `torchcss detect --download-model` has fetched
 a detector of people; `torchcss track --help` tells what else it takes.
-Bad input ends with one line on standard error and exit status 2. What was tracked before an
+Bad input ends with one line on standard error and exit status 2, a batch of which clips have failed
+with 1. What was tracked before an
 interruption is on disk: `torchcss track ... --resume` goes on."""
 
 _LEFT = {
@@ -111,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         # Settings check themselves, so that reading them may fail as well.
         verb = tyro.cli(Verb, prog="torchcss", args=words, description=_DESCRIPTION)  # type: ignore[arg-type]
-        verb.run()
+        left = verb.run()
     except TorchcssError as error:
         print(f"torchcss: {error}", file=sys.stderr)
         return 2
@@ -128,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         print(f"torchcss: interrupted{_LEFT.get(type(verb), '')}", file=sys.stderr)
         return 143 if isinstance(interruption, Terminated) else 130
-    return 0
+    return 1 if left else 0
 
 
 if __name__ == "__main__":
