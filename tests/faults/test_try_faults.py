@@ -28,7 +28,8 @@ class Forked:
         return ended
 
     def send_signal(self, number: signal.Signals) -> None:
-        os.kill(self._process.pid or 0, number)
+        if self.poll() is None:  # else nobody is there
+            os.kill(self._process.pid or 0, number)
 
     def kill(self) -> None:
         self._process.kill()
