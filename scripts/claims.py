@@ -277,7 +277,7 @@ def shares_followed(
     """
     shares, pairs = [], []
     for tracked, true in tracked_and_true(evidence, sequence, preset):
-        seen, moved = (angle(joints) - angle(joints)[0] for joints in (tracked, true))
+        seen, moved = (each - each[0] for each in map(angle, (tracked, true)))
         if np.abs(moved).max() > 10:
             shares.append(float(moved @ seen / (moved @ moved)))
             pairs.append((tracked, true))
@@ -563,10 +563,8 @@ def fewer_spurious(
             np.array(list(evidence.minima[body, "contour", *each]["fewer_by_frame"].values()))
             for each in (better, than)
         )
-        gain, error = (
-            (first - second).mean(),
-            (first - second).std() / max(len(first) - 1, 1) ** 0.5,
-        )
+        fewer = first - second
+        gain, error = fewer.mean(), fewer.std() / max(len(fewer) - 1, 1) ** 0.5
         words.append(f"{body}: {gain:.1f} fewer a line (standard error {error:.1f})")
         holds &= bool(gain > 2 * error)
     return Finding("; ".join(words), holds)

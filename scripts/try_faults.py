@@ -55,6 +55,8 @@ _WORDS = (
     *("--keypoints-use", "first", "--no-overlay"),
 )
 _SOON_S, _LATE_S, _POLL_S = 10.0, 300.0, 0.02
+_FRAME_S = 0.05
+"""What a frame takes at least, seconds."""
 _SMALL = 12_000
 """Bytes of a file that is smaller than a track of some frames."""
 
@@ -173,9 +175,10 @@ class Round:
         return any((self.out / ".batch" / "work").glob("*/*/checkpoint.npz"))
 
     def catch(self, process: subprocess.Popen[bytes]) -> None:
-        """Wait until it tracks, and a random while longer."""
+        """Wait until it tracks, and a random while longer in which it does not end."""
         self.wait_for(self.is_tracking, process)
-        time.sleep(self.moment.uniform(0, 1.0))
+        left_s = _FRAME_S * self.config.frames * self.config.clips
+        time.sleep(self.moment.uniform(0, left_s))
 
 
 def kill(batch: Round) -> None:

@@ -14,8 +14,9 @@
 | `torchcss plot TRACK` | draws its modes, trajectories and uncertainties as PNG files |
 | `torchcss report TRACK` | writes one page about it, `report.html`, as `track` does at its end |
 
-Bad input ends with one line on standard error and exit status 2; Ctrl-C with status 130 and
-SIGTERM with 143. What was tracked until then is on disk; `torchcss track ... --resume` goes on.
+Bad input ends with one line on standard error and exit status 2, a batch of which clips have failed
+with 1, Ctrl-C with 130 and SIGTERM with 143. What was tracked until then is on disk; `torchcss
+track ... --resume` goes on.
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ _DESCRIPTION = """Tracks a body with joints through a video, and keeps the poses
 `torchcss track VIDEO` needs nothing but a video once `torchcss detect --download-model` has fetched
 a detector of people; `torchcss track --help` tells what else it takes.
 Bad input ends with one line on standard error and exit status 2, a batch of which clips have failed
-with 1. What was tracked before an
-interruption is on disk: `torchcss track ... --resume` goes on."""
+with 1. What was tracked before an interruption is on disk: `torchcss track ... --resume` goes on.
+"""
 
 _LEFT = {
     Demo: "; the frames tracked so far are on disk",

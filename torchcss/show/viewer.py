@@ -175,8 +175,8 @@ def open_recording(
     spawn = spawn if spawn is not None else save is None and connect is None
     if spawn and not has_display():
         raise ConfigurationError(
-            "there is no display here to open a viewer on; save a recording, and open it elsewhere "
-            "with: rerun FILE.rrd"
+            "there is no display here to open a viewer on; save a recording (--save FILE.rrd), and "
+            "open it elsewhere with: rerun FILE.rrd"
         )
     sinks = []
     if save is not None:
