@@ -108,6 +108,21 @@ def test_where_the_video_is_gone_what_the_overlay_has_is_shown(
     assert shown == [True, True, False]
 
 
+def test_a_damaged_overlay_is_as_none(
+    folder: Path, track: Track, camera: Camera, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "overlay.mp4").write_bytes(b"no film")
+    for verb in ("plot", "report"):
+        assert cli.main([verb, str(folder)]) == 0
+        assert "overlay.mp4: damaged, without pictures: give --video" in capsys.readouterr().out
+    files = ViewFiles(video=folder / "video.mp4", keypoints=None)
+    save_track(folder / TRACK_NAME, track._replace(cameras=(RecordedCamera(camera, files),)))
+    for verb in ("plot", "report"):
+        assert cli.main([verb, str(folder)]) == 0
+        assert "overlay.mp4: damaged, drawn anew from the video" in capsys.readouterr().out
+    assert [row for row, _ in pictures_of(Run.open(folder), range(3))] == [0, 1, 2]
+
+
 def test_a_video_outside_the_run_is_told(
     folder: Path, track: Track, camera: Camera, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -84,3 +84,4 @@ class Report:
 
         run = _opened(self.track, self.given)
         print(f"wrote {write_report_page(run, anew=self.given.video is not None)}")
+        _tell_missing(run)

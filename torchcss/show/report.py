@@ -27,7 +27,7 @@ from torchcss.io.run import Run
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME
 from torchcss.io.video import VideoWriter
 from torchcss.show.posterior_plots import angles_figure
-from torchcss.show.track_pictures import has_pictures, pictures_of, without_pictures
+from torchcss.show.track_pictures import has_pictures, known_video, pictures_of, without_pictures
 from torchcss.show.track_plots import (
     check_not_empty,
     modes_figure,
@@ -151,7 +151,7 @@ def _film(run: Run, *, anew: bool) -> str:
     times = run.track.times[rows]
     span = float(times[-1] - times[0])
     rate = (len(rows) - 1) / span if span > 0 else 1.0
-    still, missing = BytesIO(), without_pictures(run)
+    still, missing = BytesIO(), None if known_video(run) else without_pictures(run)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
         with VideoWriter(path, rate, crf=_CRF) as film:

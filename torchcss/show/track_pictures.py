@@ -8,6 +8,7 @@ that the tracker left. One that went on is drawn from the video where that film 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -78,30 +79,31 @@ def known_video(run: Run) -> Path | None:
     return video if video is not None and video.exists() else None
 
 
-def overlay_of(run: Run) -> Path | None:
-    """The film that the tracker drew of these very modes, or of the first ones, if it is there."""
+def overlay_of(run: Run) -> tuple[Path, int]:
+    """The film that the tracker drew of these very modes, and how many of its frames are whole."""
     overlay = run.folder / OVERLAY_NAME
     # What the tracker drew is not what, say, a smoothed track says.
-    return overlay if run.path.name == TRACK_NAME and overlay.is_file() else None
+    if run.path.name == TRACK_NAME and overlay.is_file():
+        with suppress(VideoError):
+            return overlay, VideoReader(overlay).count_frames()
+    return overlay, 0
 
 
 def has_pictures(run: Run) -> bool:
     """Whether there is an overlay or a video."""
-    return overlay_of(run) is not None or known_video(run) is not None
+    return overlay_of(run)[1] > 0 or known_video(run) is not None
 
 
 def without_pictures(run: Run) -> str | None:
-    """A line about frames that nothing shows, as the video is gone; None: there are none.
-
-    Raises:
-        VideoError: If the overlay cannot be read.
-    """
-    overlay, count = overlay_of(run), len(run.track.frames)
-    if known_video(run) is not None:
-        return None
-    if overlay is None:
-        return "without pictures: give --video (and --camera) to see what the modes explain"
-    left = count - VideoReader(overlay).count_frames()
+    """A line about an overlay that is damaged, or frames that nothing shows; None: all is there."""
+    (overlay, whole), video = overlay_of(run), known_video(run)
+    damaged = f"{overlay}: damaged, " * (run.path.name == TRACK_NAME and overlay.is_file())
+    if video is not None:
+        return f"{damaged}drawn anew from the video" if damaged and not whole else None
+    if not whole:
+        told = "without pictures: give --video (and --camera) to see what the modes explain"
+        return damaged + told
+    left = len(run.track.frames) - whole
     told = f"{overlay}: {left} frames of the track are missing; give the video that was tracked"
     return told if left > 0 else None
 
@@ -124,14 +126,13 @@ def pictures_of(
         CameraError: If the camera is of another image size.
         TrackFileError: If the body or the camera is not known.
     """
-    overlay, video, left = overlay_of(run), known_video(run), list(rows)
-    if not left or (overlay is None and video is None):
-        return
-    if overlay is not None and (video is None or not anew):
-        for frame in VideoReader(overlay, stop=left[-1] + 1):
-            if frame.index in left:
-                left.remove(frame.index)
-                yield frame.index, frame.image
+    (overlay, whole), video, left = overlay_of(run), known_video(run), list(rows)
+    if left and whole and (video is None or not anew):
+        with suppress(VideoError):  # what follows its damage is drawn from the video
+            for frame in VideoReader(overlay, stop=left[-1] + 1):
+                if frame.index in left:
+                    left.remove(frame.index)
+                    yield frame.index, frame.image
     if left and video is not None:
         first = run.cameras[0]
         for row, image in _frames_of(run, first, tuple(left)):
