@@ -368,6 +368,8 @@ def test_nan_is_refused(tmp_path: Path) -> None:
     [
         ("covariance", np.inf, "covariance holds infinity"),
         ("times", -np.inf, "times holds infinity"),
+        ("times", 1e300, "times: expected seconds"),
+        ("times", 1 / 30 + 1e-9, "times: expected seconds"),
         ("frames", -1, "frames: expected numbers from 0 in rising order"),
         ("frames", 0, "frames: expected numbers from 0 in rising order"),
     ],

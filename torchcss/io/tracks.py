@@ -426,6 +426,12 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
     if (values["frames"] < 0).any() or (np.diff(values["frames"]) <= 0).any():
         raise TrackFileError(f"{path}: frames: expected numbers from 0 in rising order")
+    steps = np.abs(np.diff(values["times"]))
+    if (np.abs(values["times"]) > _LATEST_S).any() or ((steps > 0) & (steps < _SHORTEST_S)).any():
+        raise TrackFileError(
+            f"{path}: times: expected seconds, of frames at least {_SHORTEST_S:g} s apart and "
+            f"within {_LATEST_S:g} s of 0"
+        )
     if (empty := (values["log_weight"] == -np.inf).all(1)).any():
         raise TrackFileError(f"{path}: row {empty.argmax()}: no mode; expected one or more a frame")
     power = float(values.pop(_POWER_KEY))
@@ -436,6 +442,9 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
         raise TrackFileError(f"{path}: size_deviation: expected a number that is not negative")
     return {**values, "likelihood_power": power}
 
+
+_LATEST_S, _SHORTEST_S = 1e10, 1e-6
+"""Seconds since 1970 are among the former; no camera is faster than the latter."""
 
 _DESCRIBED = ("body", "cameras", "settings")
 

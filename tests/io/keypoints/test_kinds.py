@@ -1872,3 +1872,10 @@ def test_yolo_labels_of_all_frames_in_one_file(tmp_path: Path) -> None:
     write(tmp_path / "image0.txt", "\n".join(map(" ".join, rows)))
     with pytest.raises(KeypointError, match="12 people under 2 numbers: of several frames"):
         read(tmp_path)
+
+
+def test_a_table_of_very_many_columns(tmp_path: Path) -> None:
+    heading = [f"j{n}_{axis}" for n in range(5001) for axis in "xy"]
+    path = write(tmp_path / "a.csv", f"{','.join(heading)}\n{'1,' * 10001}1\n")
+    with pytest.raises(KeypointError, match="10002 columns, expected at most 10000: a row for"):
+        read(path)

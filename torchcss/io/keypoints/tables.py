@@ -64,6 +64,9 @@ _DECIMAL = re.compile(r"^(-?[0-9]*),([0-9]+(?:[eE][-+]?[0-9]+)?)$")
 _HAND = ("joint", "u", "v", "confidence")
 """The columns of a table that somebody typed."""
 
+_MOST_COLUMNS = 10_000
+"""Of MediaPipe's 543 landmarks of everything there are some 2000, of herds of animals more."""
+
 _WHEN = (*words.FRAMES, *words.TIMES, *words.PICTURES)
 
 Row = tuple[int, list[str]]
@@ -262,6 +265,11 @@ def table_rows(path: Path) -> list[Row]:
     )
     if not rows:
         raise KeypointError(f"{path}: the file is empty")
+    if (most := max(len(row) for _, row in rows)) > _MOST_COLUMNS:
+        raise KeypointError(
+            f"{path}: {most} columns, expected at most {_MOST_COLUMNS}: a row for every person of "
+            "every frame, x, y and confidence of the joints in columns"
+        )
     if comma == ",":
         return rows
     # Whoever separates cells by something else may write decimals with a comma.
