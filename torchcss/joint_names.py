@@ -271,14 +271,14 @@ LIMB_WORDS: Final = _of_limbs(
     "upleg upperleg legupper thigh thighbend hip",
     "knee lowerleg lowleg leglower leg calf shin shank",
     "ankle footankle foot",
-    "upperarm uparm armupper uarm arm shldr shldrbend shoulder",
+    "upperarm uparm armupper uarm bicep arm shldr shldrbend shoulder",
     "elbow forearm lowerarm lowarm armlower farm larm forearmbend",
     "wrist handwrist hand",
 )
 """What skeletons call the joint in which a limb's segment starts, without side and prefix; of
 several that are there the first: MotionBuilder, Mixamo, Rokoko; Unity, VRM and Xsens; Unreal,
-Biped and Character Creator; Rigify; Poser and DAZ Studio; OptiTrack; mocopi; Meta; Kinect, SMPL
-and robots."""
+Biped and Character Creator; Rigify and Auto-Rig Pro; Poser and DAZ Studio; OptiTrack; mocopi; Meta;
+MikuMikuDance in English; Softimage; Kinect, SMPL and robots."""
 
 _SEGMENTS: Final = frozenset(
     word for place, words in LIMB_WORDS.items() for word in words if word not in (place, "foot")
@@ -342,9 +342,9 @@ def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]])
     """Which joints are those of the limbs, by the catalogue's names."""
     places = {place for _, place in spelt}
     # `arm` and `leg` are a limb's upper or lower part only beside words for the other.
-    alone = not places & {"upleg", "upperleg", "thigh", "forearm", "lowerarm"}
-    # Beside a shin, and no word for what is above it, `leg` is the thigh (SOMA).
-    is_thigh = bool(places & {"shin", "shank", "calf"}) and not any(
+    alone = not places & {"upleg", "upperleg", "thigh", "forearm", "lowerarm", "elbow"}
+    # Beside a shin or knee, and no word for what is above it, `leg` is the thigh (SOMA).
+    is_thigh = bool(places & {"shin", "shank", "calf", "knee"}) and not any(
         side and place in table["hip"] for side, place in spelt
     )
     found: dict[str, int] = {}
@@ -376,7 +376,8 @@ def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
         sides = [index for index, word in enumerate(words) if word in known_sides]
         split.append((known_sides[words.pop(sides[0])] if len(sides) == 1 else "", words))
     every = [word for _, words in split for word in set(words)]
-    common = {word for word in every if 2 * every.count(word) >= len(names)} | {"def"}
+    common = {word for word in every if 2 * every.count(word) >= len(names)}
+    common |= {"def", "stretch"}
     result: list[tuple[str, str]] = []
     for side, words in split:
         while words and words[0] in common and "".join(words) not in known:

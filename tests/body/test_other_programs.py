@@ -50,6 +50,9 @@ def test_a_floating_joint_is_a_free_root(tmp_path: Path) -> None:
     assert "world" not in body.joint_names
     assert any("lamp" in note for note in body.notes)
     assert load_body(path, free_root=False).state_names == ("hip",)
+    below = urdf(tmp_path, joint("a", "base", "b", "fixed"), joint("c", "b", "d", "floating"),
+                 joint("hip", "d", "e"))  # fmt: skip
+    assert load_body(below).state_names[6:] == ("hip",)
     inside = urdf(tmp_path, joint("a", "base", "b"), joint("c", "b", "d", "floating"))
     with pytest.raises(BodyError, match="floating at the root"):
         load_body(inside)
@@ -79,6 +82,12 @@ def test_a_mimic_joint_of_nothing_is_free(tmp_path: Path) -> None:
     body = load_body(path)
     assert body.state_names == ("l_a", "l_b")
     assert any("'l_b' mimics 'a'" in note for note in body.notes)
+    path = urdf(tmp_path, joint("a", "a", "b", "fixed"), joint("b", "b", "c", more=mimic("a")),
+                joint("c", "c", "d", "fixed", mimic("b")))  # fmt: skip
+    assert load_body(path).state_names == ("b",)
+    assert [note.rpartition(": it ")[2] for note in load_body(path).notes[1:]] == [
+        "is taken as free", "stays fixed",
+    ]  # fmt: skip
 
 
 def test_numbers_in_other_units_are_told(tmp_path: Path) -> None:
@@ -233,3 +242,9 @@ def test_z_up(tmp_path: Path) -> None:
     # Somebody who lies, in a file that is Y up.
     path.write_text(bvh(1).replace("\n" + " ".join(["0"] * 33), "\n0 0 0 0 90 0" + " 0" * 27))
     assert not any("Z up" in line for line in read_motion_capture(path).report)
+    # Or who stands, in motions of another data set on a skeleton that is Y up at rest.
+    told = "the person lies along Z, not at rest: if Z is the file's vertical, say up='z'"
+    assert told in read_motion_capture(path).report
+    motion = read_motion_capture(path, up="z")
+    assert motion.joints[0, head, 1] - motion.joints[0, foot, 1] > 0.9
+    assert told not in motion.report

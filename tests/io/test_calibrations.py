@@ -178,14 +178,25 @@ def test_matlab(tmp_path: Path, form: str) -> None:
     savemat(tmp_path / "a.mat", content)
     check(tmp_path / "a.mat")
     plain = {key: np.asarray(each).tolist() for key, each in values.items()}
-    (tmp_path / "a.json").write_text(json.dumps(plain))
-    check(tmp_path / "a.json")
+    for content in (plain, {"Intrinsics": plain, "RotationVectors": [[0.1, 0.2, 0.3]]}):
+        (tmp_path / "a.json").write_text(json.dumps(content))
+        check(tmp_path / "a.json")
 
 
 def test_bouguets_toolbox(tmp_path: Path) -> None:
     values = {"fc": [[FX], [FY]], "cc": [[CX], [CY]], "kc": np.array(LENS)[:, None], "nx": 640}
     savemat(tmp_path / "Calib_Results.mat", {**values, "ny": 480})
     check(tmp_path / "Calib_Results.mat")
+    script = ["%-- Focal length: [ px ];", f"fc = [ {FX} ; {FY} ];", f"cc = [ {CX} ; {CY} ];"]
+    script += [
+        f"kc = [ {' ; '.join(map(str, LENS))} ];",
+        "alpha_c = 0.0;",
+        "nx = 640;",
+        "ny = 480;",
+    ]
+    script += ["omc_1 = [ 1.6 ; 1.6 ; -0.6 ];", "Tc_1  = [ -177.8 ; -83.1 ; 852.4 ];"]
+    (tmp_path / "Calib_Results.m").write_text("\n".join(script))
+    check(tmp_path / "Calib_Results.m")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@
 | COLMAP | `cameras.txt` or `cameras.bin`, or their folder; `images` beside say places |
 | KITTI, ROS | `.txt`: numbers below or behind what they are |
 | Qualisys, Vicon | `.qca.txt`, `.xcp` |
-| MATLAB | `.mat`: `cameraParams` as a structure, or Bouguet's `fc`, `cc`, `kc`; JSON |
+| MATLAB | `.mat`: `cameraParams` as a structure; JSON; Bouguet's `fc`, `cc`, `kc`, `.m` too |
 | arrays | `.npz`: `mtx`, `dist`, and the like; `.txt`, `.npy`: K or P alone; of several cameras |
 
 Most of them are the same few things in other words (`_WORDS`). COLMAP's principal point counts from
@@ -245,7 +245,7 @@ def _read_folder(path: Path) -> dict[str, Entry]:
 # The same things in other words.
 
 
-def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
+def _entry(values: Mapping[str, Any], units: Any = "metre", *, is_matlab: bool = False) -> Entry:
     """A camera of a mapping, by whatever words it uses."""
     values = {key: None if each == "null" else each for key, each in values.items()}
     inner = [word for word, each in values.items() if _is_inner(word, each)]
@@ -264,6 +264,8 @@ def _entry(values: Mapping[str, Any], units: Any = "metre") -> Entry:
         found |= parts if projection[:, 3].any() else {"K": parts["K"]}
     models = [str(first_of(values, (word,))) for word in _MODELS]
     fisheye = _fisheye(values, models)
+    if (is_matlab or "RadialDistortion" in values) and not fisheye:
+        found = {"K": _from_one(found["K"]), "rotation": None, "translation": None}
     lens, size, video = _lens(values, fisheye), _said_size(values), values.get("video")
     if isinstance(fisheye, Mirror) and _shape(found["K"]) == (4 + len(fisheye.parameters),):
         found["K"] = found["K"][len(fisheye.parameters) :]  # Kalibr has all in one
@@ -538,8 +540,6 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
     """The only camera of a file, or cameras by name or in a list; their unit if none is said."""
     if not isinstance(content, dict):
         raise unexpected(CameraError, path, "an object 'cameras' with one under each name", content)
-    if "RadialDistortion" in content and _has_camera(content):
-        return {path.stem: _matlab_entry(content)}
     frames = listed(content.get("frames"))
     if pictures := [each for each in frames if isinstance(each, dict) and _OF_NERF in each]:
         return _nerf_entries(path, content, pictures)
@@ -562,10 +562,7 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
             raise unexpected(CameraError, f"{path}: camera {name!r}", "an object", values)
     said = first_of(content, ("units", "unit"))
     return {
-        str(name): _matlab_entry(each)
-        if "RadialDistortion" in each
-        else _entry(each, units if said is None else said)
-        for name, each in cameras.items()
+        str(name): _entry(each, units if said is None else said) for name, each in cameras.items()
     }
 
 
@@ -836,7 +833,7 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
     for each in [each for each in values.values() if isinstance(each, dict)]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
         if all(map(_has_camera, pair.values())):
-            return {n: _matlab_entry(each) for n, each in pair.items() if each is not None}
+            return {n: _entry(each, is_matlab=True) for n, each in pair.items() if each is not None}
         values = each if _has_camera(each) else values
     if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
         return _alone(path, values)
@@ -844,7 +841,18 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
         raise unexpected(
             CameraError, f"{path}", "toStruct(cameraParams) or Bouguet's fc and cc", list(values)
         )
-    return {path.stem: _matlab_entry(values)}
+    return {path.stem: _entry(values, is_matlab=True)}
+
+
+def _read_bouguet(path: Path) -> dict[str, Entry]:
+    """What Bouguet's toolbox saves as a script: `fc = [ 657.4 ; 657.8 ];`."""
+    text = re.sub(r"(?m)%.*$", "", read_text(path, CameraError))
+    found = re.findall(r"(?m)^\s*(\w+)\s*=\s*\[?([-+0-9.eE;,\s]+)\]?\s*;", text)
+    with refusing(CameraError, f"{path}: not a script of numbers"):
+        lists = {name: [float(n) for n in re.split(r"[;,\s]+", row) if n] for name, row in found}
+    return _alone(
+        path, {name: each if each[1:] else each[0] for name, each in lists.items() if each}
+    )
 
 
 def _check_matlab_size(path: Path) -> None:
@@ -862,14 +870,12 @@ def _check_matlab_size(path: Path) -> None:
             raise CameraError(f"{path}: more than {_MOST_BYTES:,} bytes; not a calibration")
 
 
-def _matlab_entry(values: Mapping[str, Any]) -> Entry:
-    found = _entry(values)
-    if found.fisheye:
-        return found
+def _from_one(K: Any) -> list[Any]:
+    """MATLAB's intrinsic matrix, or fx, fy, cx, cy, with pixels that count from 0."""
     with refusing(CameraError, "expected cameraParams"):
-        K = real_numbers(found.K, "K", CameraError)
+        K = real_numbers(K, "K", CameraError)
         K = K - (0, 0, 1, 1) if K.shape == (4,) else K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
-    return found._replace(K=K.tolist(), rotation=None, translation=None)
+    return K.tolist()
 
 
 def _listed(value: Any) -> Any:
@@ -1105,9 +1111,9 @@ def _load(path: Path) -> dict[str, Any]:
 
 _READERS = {
     **dict.fromkeys((".yml", ".yaml"), _read_yaml),
-    **dict.fromkeys((".txt", ".csv"), _read_text),
+    **dict.fromkeys((".txt", ".csv", ".ini"), _read_text),
     **dict.fromkeys((".npy", ".npz"), _read_arrays),
     **{".bin": _read_binary, ".mat": _read_matlab, ".toml": _read_toml, ".xml": _read_xml},
-    ".xcp": _read_vicon,
+    **{".xcp": _read_vicon, ".m": _read_bouguet},
 }
 """By the suffix; everything else is JSON."""

@@ -1879,3 +1879,16 @@ def test_a_table_of_very_many_columns(tmp_path: Path) -> None:
     path = write(tmp_path / "a.csv", f"{','.join(heading)}\n{'1,' * 10001}1\n")
     with pytest.raises(KeypointError, match="10002 columns, expected at most 10000: a row for"):
         read(path)
+
+
+@pytest.mark.parametrize("axes", [(2, 0, 1), (2, 1, 0), (1, 2, 0), (0, 2, 1), (1, 0, 2)])
+def test_axes_in_other_orders(tmp_path: Path, axes: tuple[int, int, int]) -> None:
+    array = np.stack([person(t) for t in T]).transpose(axes)
+    if axes == (1, 0, 2):  # frames behind joints, in the place of people
+        np.save(tmp_path / "a.npy", array)
+        with pytest.raises(KeypointError, match="17"):
+            read(tmp_path / "a.npy")
+        return
+    for each in (array, array[None, ..., None]):
+        np.save(tmp_path / "a.npy", each)
+        check(read(tmp_path / "a.npy"))

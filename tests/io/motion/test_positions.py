@@ -405,6 +405,23 @@ def test_a_leg_above_a_shin_is_the_thigh() -> None:
     assert skeleton_joint_names(usual) == ("l_hip", "l_knee", "l_ankle", "l_elbow")
 
 
+@pytest.mark.parametrize(
+    "limbs",
+    [
+        "leg_{} knee_{} ankle_{} arm_{} elbow_{} wrist_{} shoulder_{}",  # MikuMikuDance
+        "thigh_stretch.{} leg_stretch.{} foot.{} arm_stretch.{} forearm_stretch.{} hand.{} "
+        "shoulder.{}",  # Auto-Rig Pro
+        "{}_Thigh {}_Shin {}_Foot {}_Bicep {}_Forearm {}_Hand {}_Shoulder",  # Softimage
+    ],
+)
+def test_the_shoulder_of_a_skeleton_with_an_arm_is_the_collar_bone(limbs: str) -> None:
+    for side in "lr":
+        names = limbs.format(*7 * [side]).split()
+        found = skeleton_joint_names(["Hips", *names])[1:]
+        places = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
+        assert found == (*(f"{side}_{place}" for place in places), None)
+
+
 def test_without_hips_there_is_nothing_to_follow() -> None:
     with pytest.raises(MotionCaptureError, match="hips and shoulders"):
         limb_positions(a_motion(("l_hip", "l_shoulder", "r_shoulder", "head")))

@@ -90,7 +90,7 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTr
     """
     segments, values, _ = parse_bvh(path)
     segments, empty = without_empty_positions(segments, values)
-    num_frames, is_z_up = len(values), stands_along_z(segments, values)
+    num_frames, is_z_up = len(values), all(stands_along_z(segments, values))
     if not num_frames:  # a skeleton alone: one pose, all channels zero
         values = np.zeros((1, values.shape[1]))
     scale, unit_line = _metres(path, segments, units)
@@ -207,8 +207,10 @@ def rest_positions(segments: Sequence[Segment]) -> Float[np.ndarray, "j 3"]:
     return rest
 
 
-def stands_along_z(segments: Sequence[Segment], values: Float[np.ndarray, "t c"]) -> bool:
-    """Whether head and feet of a person lie above each other along Z, at rest and in the motion.
+def stands_along_z(
+    segments: Sequence[Segment], values: Float[np.ndarray, "t c"]
+) -> tuple[bool, bool]:
+    """Whether head and feet of a person lie above each other along Z: at rest, in the motion.
 
     Args:
         segments: The skeleton.
@@ -224,15 +226,16 @@ def stands_along_z(segments: Sequence[Segment], values: Float[np.ndarray, "t c"]
         )
     )
     if not high or not low:
-        return False
+        return False, False
     up = rest[high].mean(0) - rest[low].mean(0)
     turned = np.broadcast_to(np.eye(3), (max(len(values), 1), 3, 3))
     for turn in segments[0].turns if len(values) else ():
         if turn.is_rotation:
             turned = turned @ about(turn.axis, values[:, turn.column])
     mean = (turned @ up).mean(0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return all(bool(v[2] > share * np.linalg.norm(v)) for v, share in ((up, 0.9), (mean, 0.7)))
+    with np.errstate(all="ignore"):
+        share = [float(v[2] / np.linalg.norm(v)) for v in (up, mean)]
+    return share[0] > 0.9, share[1] > 0.7
 
 
 def _metres(

@@ -1,11 +1,11 @@
 """A body from a URDF file: its tree, limits, simple solids and boxes of meshes.
 
 The parser of pytorch-kinematics leaves limits and mimic joints out, and keeps seven digits of
-origins and axes: the file is read here. A floating joint of the root link is a free root, and what
-hangs on that link beside it is left out. Solids are boxes, cylinders, spheres and capsules: the
-visual ones of a link, or where it has none those for collisions. A link that has only meshes is as
-large as the box around them, in its own frame, if they are STL, OBJ or COLLADA files in the folder
-of the URDF or below it; others are not opened.
+origins and axes: the file is read here. A floating joint of the root link, or of one that is fixed
+to it, is a free root, and what hangs on that link beside it is left out. Solids are boxes,
+cylinders, spheres and capsules: the visual ones of a link, or where it has none those for
+collisions. A link that has only meshes is as large as the box around them, in its own frame, if
+they are STL, OBJ or COLLADA files in the folder of the URDF or below it; others are not opened.
 
 Call `read_urdf`; `torchcss.load_body("x.urdf")` does.
 """
@@ -85,14 +85,14 @@ def read_urdf(
     floats = _take_off_the_world(robot, notes)
     elements = {element.get("name", ""): element for element in robot.findall("joint")}
     root = _check_links(robot, elements)
+    moving = {name for name, element in elements.items() if element.get("type") != "fixed"}
     for name, element in elements.items():
         mimic = element.find("mimic")
-        if mimic is not None and mimic.get("joint") not in elements:
+        if mimic is not None and not {name, mimic.get("joint")} <= moving:
             element.remove(mimic)
-            notes.append(
-                f"joint {name!r} mimics {mimic.get('joint')!r}, which is no joint: it is taken as "
-                "free"
-            )
+            told = "is taken as free" if name in moving else "stays fixed"
+            of = mimic.get("joint")
+            notes.append(f"joint {name!r} mimics {of!r}, which is no joint that moves: it {told}")
     joints = _tree(root, elements)
     turned = [name for name, element in elements.items() if _turns_more_than_once(name, element)]
     if turned:
@@ -116,13 +116,15 @@ def read_urdf(
 def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
     """Keep only what hangs on a floating joint of the root link; whether there is one."""
     joints = robot.findall("joint")
-    children = {_link(joint, "child") for joint in joints}
-    floating = [
-        joint
-        for joint in joints
-        if joint.get("type") == "floating" and _link(joint, "parent") not in children
-    ]
+    above = {_link(joint, "child"): joint for joint in joints}
+    floating = [joint for joint in joints if joint.get("type") == "floating"]
     if len(floating) != 1:
+        return False
+    link = _link(floating[0], "parent")
+    for _ in joints:  # what it hangs on stands still
+        if link in above and above[link].get("type") == "fixed":
+            link = _link(above[link], "parent")
+    if link in above:
         return False
     kept = [_link(floating[0], "child")]
     for link in kept:  # grows while it is walked

@@ -3,9 +3,10 @@
 Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; of several people `[T P J 2]`,
 `[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`), and
 `points [T P J 3]` (`read_points`). Read as well, as NPY or as the only array of an NPZ: pairs or
-triples `[T J 2]`, `[T J 3]` (x, y, confidence), in a row `[T 3 J]`, of several people `[T P J 3]`,
-of one picture `[J 3]`, and MoveNet's `[T 1 1 17 3]` or, in fractions, `[T 1 17 3]` (y, x,
-confidence). Confidences may be called `scores` and the like.
+triples `[T J 2]`, `[T J 3]` (x, y, confidence), in another order of axes where their sizes tell it
+(ST-GCN's `[3 T J 1]`), of several people `[T P J 3]`, of one picture `[J 3]`, and MoveNet's
+`[T 1 1 17 3]` or, in fractions, `[T 1 17 3]` (y, x, confidence). Confidences may be called `scores`
+and the like.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ def is_movenet(array: np.ndarray, *, alone: bool = True) -> bool:
 
     Of joints in a row of people or pictures that is told by the trunk, which is rather upright.
     """
-    if array.ndim == 5 or array.shape[-1] == 56:
+    if (array.ndim == 5 and array.shape[-1] == 3) or array.shape[-1] == 56:
         return True
     if not alone or array.shape[-2:] != (17, 3) or not bool(((array >= 0) & (array <= 1)).all()):
         return False
@@ -214,6 +215,8 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
             values = values[..., [0, 1, 3]]
         elif len(shape) == 3 and shape[1] in (2, 3) and shape[2] in LAYOUT_SIZES:
             values = values.swapaxes(1, 2)
+        elif shape[-1] not in (2, 3) and (axes := _axes(values.squeeze().shape)) is not None:
+            values = values.squeeze().transpose(axes)
         elif len(shape) == 2 and shape[1] in (2, 3) and shape[0] in LAYOUT_SIZES:
             values = values[None]
         elif len(shape) == 2:
@@ -225,6 +228,16 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
             return values.reshape(len(values), -1, *values.shape[-2:])
     expected = "numbers [frames, joints, 2 or 3] or [frames, people, joints, 2 or 3]"
     raise _unfit(name, array, expected)
+
+
+def _axes(shape: Sequence[int]) -> list[int] | None:
+    """Which axes are frames, joints and coordinates where only their sizes tell; None: unclear."""
+    places = [[axis for axis, size in enumerate(shape) if size in sizes]
+              for sizes in (LAYOUT_SIZES, (2, 3))]  # fmt: skip
+    if len(shape) != 3 or [len(each) for each in places] != [1, 1]:
+        return None
+    (joints,), (xy,) = places
+    return [3 - joints - xy, joints, xy]
 
 
 def _with_confidence(

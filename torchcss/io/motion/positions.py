@@ -119,10 +119,16 @@ def read_motion_capture(
             scale, line = guess_units(path, skeleton_span(rest, segments), stated)
             report.append(line)
         rest, joints = scale * rest, scale * joints
-        is_z_up = path.suffix.lower() == ".bvh" if up is None else up == "z"
-        if is_z_up and (up is not None or stands_along_z(segments, values)):
+        along_z = (up == "z",) * 2
+        if up is None and path.suffix.lower() == ".bvh":
+            along_z = stands_along_z(segments, values)
+        if all(along_z):
             rest, joints = rest @ _Z_TO_Y, joints @ _Z_TO_Y
             report.append(Z_UP_NOTE if up is None else "Z up, as given: turned to Y up")
+        elif along_z[1]:
+            report.append(
+                "the person lies along Z, not at rest: if Z is the file's vertical, say up='z'"
+            )
     if not (np.isfinite(rest).all() and np.isfinite(joints).all()):
         frame = int(np.argmin(np.isfinite(joints).all((1, 2))))
         raise MotionCaptureError(
