@@ -1881,14 +1881,14 @@ def test_a_table_of_very_many_columns(tmp_path: Path) -> None:
         read(path)
 
 
-@pytest.mark.parametrize("axes", [(2, 0, 1), (2, 1, 0), (1, 2, 0), (0, 2, 1), (1, 0, 2)])
+@pytest.mark.parametrize("axes", [(2, 0, 1), (2, 1, 0), (1, 2, 0)])
 def test_axes_in_other_orders(tmp_path: Path, axes: tuple[int, int, int]) -> None:
-    array = np.stack([person(t) for t in T]).transpose(axes)
-    if axes == (1, 0, 2):  # frames behind joints, in the place of people
-        np.save(tmp_path / "a.npy", array)
-        with pytest.raises(KeypointError, match="17"):
-            read(tmp_path / "a.npy")
-        return
-    for each in (array, array[None, ..., None]):
+    array = np.stack([person(t) for t in range(12)])
+    for each in (array.transpose(axes), array.transpose(axes)[None, ..., None]):
         np.save(tmp_path / "a.npy", each)
-        check(read(tmp_path / "a.npy"))
+        found = read(tmp_path / "a.npy", num_frames=12)
+        np.testing.assert_array_equal(found.positions, array[..., :2])
+        np.testing.assert_array_equal(found.confidence, array[..., 2])
+    np.save(tmp_path / "a.npy", np.zeros((3, 17, 5)))  # five numbers of a joint
+    with pytest.raises(KeypointError, match="expected numbers"):
+        read(tmp_path / "a.npy", num_frames=None)

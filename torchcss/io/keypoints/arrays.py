@@ -50,6 +50,9 @@ _FREEMOCAP = (553, 3)
 MOST_BYTES = 2**31
 """Bytes of the largest set of arrays of keypoints: as of 33 people with 133 in 20,000 frames."""
 
+_MOST_NUMBERS = 8
+"""Of a joint: what is more are frames."""
+
 _MOST_PEOPLE = 30
 """More people than this in a single frame are one person in so many frames: networks that lift
 joints to space take and give `[1 T J 3]`."""
@@ -215,7 +218,7 @@ def _people(name: str, array: np.ndarray) -> np.ndarray:
             values = values[..., [0, 1, 3]]
         elif len(shape) == 3 and shape[1] in (2, 3) and shape[2] in LAYOUT_SIZES:
             values = values.swapaxes(1, 2)
-        elif shape[-1] not in (2, 3) and (axes := _axes(values.squeeze().shape)) is not None:
+        elif (axes := _axes(values.squeeze().shape)) is not None:
             values = values.squeeze().transpose(axes)
         elif len(shape) == 2 and shape[1] in (2, 3) and shape[0] in LAYOUT_SIZES:
             values = values[None]
@@ -237,6 +240,8 @@ def _axes(shape: Sequence[int]) -> list[int] | None:
     if len(shape) != 3 or [len(each) for each in places] != [1, 1]:
         return None
     (joints,), (xy,) = places
+    if xy == 2 or (joints < 2 and shape[2] <= _MOST_NUMBERS):
+        return None  # as it is
     return [3 - joints - xy, joints, xy]
 
 
