@@ -908,7 +908,7 @@ def test_rows_without_a_frame_are_as_many_as_the_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "kinds",
     [("X", "Y", "Score"), (" (x)", " (y)", " (conf)"), ("_u", "_v", "_c"), (":x", ":y", ":p"),
-     ("_x_px", "_y_px", "_keypoint_score")],
+     ("_x_px", "_y_px", "_keypoint_score"), ("_image_x", "_image_y", "_vis")],
 )  # fmt: skip
 def test_columns_of_joints(tmp_path: Path, kinds: tuple[str, ...]) -> None:
     rows = [[t, *person(t).flat, ""] for t in T]  # and a comma at the end of the line
@@ -1437,6 +1437,18 @@ def test_nanoseconds(tmp_path: Path, form: str) -> None:
         entries = [{"timestamp": int(k), "joints": person(t).tolist()} for k, t in times.items()]
         path = write(tmp_path / "a.json", entries)
     check(read(path, frame_rate=25.0), (3,))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_times_as_keys(tmp_path: Path, unit: float) -> None:
+    frames = {f"{unit * t / 25:.3f}": person(t).tolist() for t in SEEN}
+    check(read(write(tmp_path / "a.json", frames), frame_rate=25.0), (3,))
+
+
+def test_columns_of_joints_by_index(tmp_path: Path) -> None:
+    heads = [f"keypoints[{n}].{axis}" for n in range(17) for axis in ("x", "y", "score")]
+    rows = [[t, *person(t).flat] for t in T]
+    check(read(write(tmp_path / "a.csv", wide(["frame", *heads], rows))))
 
 
 def test_the_number_of_a_picture_is_the_one_that_changes(tmp_path: Path) -> None:

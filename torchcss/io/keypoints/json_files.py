@@ -89,6 +89,9 @@ _BY_LINES = (".jsonl", ".ndjson", ".txt")
 _HUGE = 1e19
 """No number of a frame is so large, nor a time, were it in nanoseconds since 1970."""
 
+_TIME = re.compile(r"[0-9]+\.[0-9]+")
+"""A key that is a time, and no number of a frame."""
+
 _FRAMES = ("frames", "instanceinfo", "results", "data")
 
 
@@ -252,7 +255,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
             found = {key: people_of(f"{path}: {key}", value) for key, value in content.items()}
             if any(found.values()):
-                return found
+                times = {float(key): each for key, each in found.items() if _TIME.fullmatch(key)}
+                return found if len(times) < len(found) else in_seconds("t", {**times})
     if not isinstance(content, list):
         raise KeypointError(
             f"{path}: not a keypoint file; expected what a detector writes (docs/guide.md lists "

@@ -50,12 +50,12 @@ _PARTS = {
 """What a column's name says that it is: 0, 1 coordinates, 2 confidence, 3 not used."""
 
 _UNITS = frozenset(
-    names_in("px pixel pixels norm normalised normalized pos position coord loc img 2d")
+    names_in("px pixel pixels norm normalised normalized pos position coord loc img image color 2d")
 )
 _PIXELS = re.compile("(?i)(^|_)(px|pixels?)(_|$)")
 _FRACTIONS = re.compile("(?i)(^|_)norm(ali[sz]ed)?(_|$)")
 _IN_SPACE = frozenset(names_in("obj world 3d"))
-_POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)(_|(?=[0-9])))+"
+_POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)s?(_|(?=[0-9])))+"
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
 _NUMBER = re.compile(r"([-+]?[0-9.,]+([eE][-+]?[0-9]+)?|nan)$")
