@@ -1904,3 +1904,15 @@ def test_axes_in_other_orders(tmp_path: Path, axes: tuple[int, int, int]) -> Non
     np.save(tmp_path / "a.npy", np.zeros((3, 17, 5)))  # five numbers of a joint
     with pytest.raises(KeypointError, match="expected numbers"):
         read(tmp_path / "a.npy", num_frames=None)
+
+
+def test_numbers_of_pictures_with_a_decimal_point(tmp_path: Path) -> None:
+    """As pandas writes a column in which some are missing; and two pictures of one name."""
+    marks = [{"image_id": float(t), "keypoints": flat(t), "category_id": 1.0} for t in SEEN]
+    check(read(write(tmp_path / "a.json", marks)), (3,))
+    images = [{"id": float(t), "file_name": f"{t}.png", "width": 640, "height": 480} for t in T]
+    path = write(tmp_path / "b.json", {"images": images, "annotations": marks})
+    check(read(path), (3,))
+    images[1]["file_name"] = "0.png"
+    with pytest.raises(KeypointError, match="an id and file_name of their own each"):
+        read(write(path, {"images": images, "annotations": marks}))

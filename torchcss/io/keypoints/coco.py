@@ -35,9 +35,9 @@ def read_coco(content: Mapping[str, Any]) -> People:
     found: Frames = {}
     for index, entry in enumerate(entries):
         where = f"detection {index}"
-        image = entry.get("image_id")
-        if not isinstance(image, (int, str)) or isinstance(image, bool):
-            raise unexpected(KeypointError, where, "an image_id", image)
+        image = _identifier(entry.get("image_id"))
+        if image is None:
+            raise unexpected(KeypointError, where, "an image_id", entry.get("image_id"))
         # COCO also annotates things that have no joints, and other skeletons.
         if "keypoints" in entry and category in (None, entry.get("category_id")):
             about = entry.get("attributes")
@@ -48,6 +48,13 @@ def read_coco(content: Mapping[str, Any]) -> People:
         return People(found, names, report)
     frames, size = _by_images(content["images"], found)
     return People(frames, names, report, size_wh=size, whole=True)
+
+
+def _identifier(value: object) -> int | str | None:
+    """A picture's number, maybe with a decimal point (pandas), or name; None: it is none."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value if isinstance(value, (int, str)) and not isinstance(value, bool) else None
 
 
 def _coco_names(
@@ -73,15 +80,16 @@ def _by_images(
     images: object, found: Mapping[Key, list[Person]]
 ) -> tuple[Frames, tuple[float, float] | None]:
     """People by the names of their pictures, and the size that all of these have."""
-    if not isinstance(images, list) or not all(
-        isinstance(image, dict) and isinstance(image.get("id"), (int, str)) for image in images
-    ):
-        raise KeypointError("expected 'images' to be a list with an id each")
-    identifiers = {image["id"] for image in images}
-    if unknown := [image for image in found if image not in identifiers]:
+    names: dict[Key, str] = {}
+    for image in listed(images):
+        if isinstance(image, dict) and (own := _identifier(image.get("id"))) is not None:
+            names[own] = str(image.get("file_name", own))
+    if not isinstance(images, list) or len(set(names.values())) < len(images):
+        raise KeypointError(
+            "expected 'images' to be a list with an id and file_name of their own each"
+        )
+    if unknown := [image for image in found if image not in names]:
         raise KeypointError(f"detection of image {unknown[0]!r}, which is not in 'images'")
-    ordered = sorted(images, key=lambda each: natural_order(str(each.get("file_name", each["id"]))))
-    frames: Frames = {
-        str(image.get("file_name", image["id"])): found.get(image["id"], []) for image in ordered
-    }
+    ordered = sorted(names, key=lambda image: natural_order(names[image]))
+    frames: Frames = {names[image]: found.get(image, []) for image in ordered}
     return frames, one_size({said_size(image) for image in images})

@@ -255,8 +255,9 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
             found = {key: people_of(f"{path}: {key}", value) for key, value in content.items()}
             if any(found.values()):
-                times = {float(key): each for key, each in found.items() if _TIME.fullmatch(key)}
-                return found if len(times) < len(found) else in_seconds("t", {**times})
+                are_times = all(map(_TIME.fullmatch, content))
+                frames: Frames = {float(k) if are_times else k: p for k, p in found.items()}
+                return in_seconds("t", frames) if are_times else frames
     if not isinstance(content, list):
         raise KeypointError(
             f"{path}: not a keypoint file; expected what a detector writes (docs/guide.md lists "
@@ -309,7 +310,7 @@ def _key_of(where: str, entry: object) -> Key | None:
     """Which frame an entry says that it is."""
     if not isinstance(entry, dict):
         return None
-    if not isinstance(entry.get("image_id", 0), (int, str)):
+    if not isinstance(entry.get("image_id", 0), (int, float, str)):
         raise unexpected(KeypointError, where, "an image_id", entry["image_id"])
     counts = {
         k: v
