@@ -197,6 +197,17 @@ def test_bouguets_toolbox(tmp_path: Path) -> None:
     script += ["omc_1 = [ 1.6 ; 1.6 ; -0.6 ];", "Tc_1  = [ -177.8 ; -83.1 ; 852.4 ];"]
     (tmp_path / "Calib_Results.m").write_text("\n".join(script))
     check(tmp_path / "Calib_Results.m")
+    pair = {
+        f"{n}_{side}": each for n, each in values.items() if n != "nx" for side in ("left", "right")
+    }
+    savemat(tmp_path / "stereo.mat", {**pair, "nx": 640, "ny": 480, "T": [[-100], [0], [0]]})
+    check(tmp_path / "stereo.mat", name="right")
+
+
+def test_opencvs_words_in_a_mat_count_from_zero(tmp_path: Path) -> None:
+    values = {"cameraMatrix": K, "distCoeffs": [LENS], "image_width": 640, "image_height": 480}
+    savemat(tmp_path / "a.mat", values)
+    check(tmp_path / "a.mat")
 
 
 @pytest.mark.parametrize(

@@ -435,6 +435,14 @@ def test_easymocap(easymocap: Path, name: str) -> None:
     assert camera.t_camera_world.tolist() == [0, 0, 4]
 
 
+def test_easymocap_in_millimetres(easymocap: Path) -> None:
+    """The unit is that of the board that somebody typed."""
+    (easymocap / "extri.yml").write_text(EXTRI.replace("0., 0., 4. ]", "100., 200., 4000. ]"))
+    found = load_camera(easymocap, name="3")
+    np.testing.assert_allclose(found.camera.t_camera_world, [0.1, 0.2, 4])
+    assert "millimetres" in str(found.units_note)
+
+
 def test_easymocap_without_sizes_takes_the_videos(easymocap: Path) -> None:
     with pytest.raises(CameraError, match="does not say the image size; give the video"):
         load_camera(easymocap, name="2")

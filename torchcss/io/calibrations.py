@@ -156,6 +156,9 @@ _ROUNDING = 1e-3
 _INVERSE = re.compile("inverse", re.IGNORECASE)
 """RealSense's model whose coefficients undo the distortion."""
 
+_OPENCV = re.compile("mtx$|cameramatrix$|dist(ortion)?(coef|$)")
+"""OpenCV's names of K and of a lens's coefficients."""
+
 _NUMBERS = re.compile(r"[-+0-9.eE\s]+")
 
 _FISHEYE_NUMBERS = re.compile("fish_?eye_?(param|model|coeff)", re.IGNORECASE)
@@ -507,7 +510,8 @@ def _numbered(values: object) -> dict[str, dict[str, Any]]:
             r"([A-Za-z]\w*?)_?([0-9]+|[LRlr]|(?<=_)left|(?<=_)right)", str(key)
         ):
             found.setdefault(match[2], {})[match[1]] = value
-    for words in (_WORDS["K"], _PROJECTIONS):  # beside K those are of the rectified pictures
+    # Beside K projections are of the rectified pictures; Bouguet's have focal lengths.
+    for words in (_WORDS["K"], _PROJECTIONS, _WORDS["focal"]):
         named = [n for n, own in found.items() if isinstance(first_of(own, words), (list, dict))]
         if named:
             return {n: {**values, **found[n]} for n in named}  # type: ignore[dict-item]
@@ -815,7 +819,7 @@ def _read_easymocap(path: Path) -> dict[str, Entry]:
         both, end = [*first.items(), *second.items()], f"_{name}"
         own = {key.removesuffix(end): each for key, each in both if key.endswith(end)}
         entries[name] = _entry({**own, "R": own.get("Rot", own.get("R"))})  # the same as a vector
-    return entries
+    return _in_metres(entries, is_anipose=False)
 
 
 def _read_matlab(path: Path) -> dict[str, Entry]:
@@ -835,7 +839,8 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
         if all(map(_has_camera, pair.values())):
             return {n: _entry(each, is_matlab=True) for n, each in pair.items() if each is not None}
         values = each if _has_camera(each) else values
-    if {"fc", "cc"} <= values.keys():  # Bouguet's toolbox, whose pixels count from 0
+    # Bouguet's toolbox and OpenCV's words, whose pixels count from 0.
+    if {"fc", "fc_left"} & values.keys() or any(map(_OPENCV.match, map(plain_word, values))):
         return _alone(path, values)
     if not _has_camera(values):
         raise unexpected(
