@@ -426,6 +426,15 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
     if (values["frames"] < 0).any() or (np.diff(values["frames"]) <= 0).any():
         raise TrackFileError(f"{path}: frames: expected numbers from 0 in rising order")
+    for name in ("state", "covariance", "joints_world", "base_transform"):
+        if max(values[name].max(initial=0), -values[name].min(initial=0)) > _LARGEST:
+            raise TrackFileError(f"{path}: {name}: expected numbers up to {_LARGEST:g}")
+    if (np.diagonal(values["covariance"], axis1=-2, axis2=-1) < 0).any():
+        raise TrackFileError(f"{path}: covariance: expected variances that are not negative")
+    if not np.linalg.det(values["base_transform"][:, :3, :3]).all():
+        raise TrackFileError(f"{path}: base_transform: expected a rotation and a place")
+    if (values["log_weight"] > _LARGEST_WEIGHT).any():
+        raise TrackFileError(f"{path}: log_weight: expected logarithms of weights, at most 1")
     steps = np.abs(np.diff(values["times"]))
     if (np.abs(values["times"]) > _LATEST_S).any() or ((steps > 0) & (steps < _SHORTEST_S)).any():
         raise TrackFileError(
@@ -442,6 +451,12 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
         raise TrackFileError(f"{path}: size_deviation: expected a number that is not negative")
     return {**values, "likelihood_power": power}
 
+
+_LARGEST = 1e9
+"""Of radians, metres and their variances; more overflows where it is squared."""
+
+_LARGEST_WEIGHT = 100.0
+"""Of the logarithm, whatever it is that weights are scaled by."""
 
 _LATEST_S, _SHORTEST_S = 1e10, 1e-6
 """Seconds since 1970 are among the former; no camera is faster than the latter."""

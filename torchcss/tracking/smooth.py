@@ -132,15 +132,18 @@ def smooth_modes(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         choice: How to smooth.
 
     Raises:
-        TrackFileError: If the track is empty, or its times do not rise.
+        TrackFileError: If the track is empty, its times do not rise, or a covariance is none.
     """
     if not len(track.times):
         raise TrackFileError("the track has no frames, of which any could be smoothed")
     if not (track.times.diff() > 0).all():
         raise TrackFileError("the times of the track do not rise; it cannot be smoothed")
-    if choice.lag is None:
-        return _all_in_view(body, track, choice)
-    return _with_lag(body, track, choice, choice.lag)
+    try:
+        if choice.lag is None:
+            return _all_in_view(body, track, choice)
+        return _with_lag(body, track, choice, choice.lag)
+    except torch.linalg.LinAlgError as error:  # a tracker's are positive definite
+        raise TrackFileError("a covariance of the track is none; it cannot be smoothed") from error
 
 
 def _with_lag(body: BodyModel, track: TrackedModes, choice: Smoothing, lag: int) -> Smoothed:
