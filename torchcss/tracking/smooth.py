@@ -142,7 +142,7 @@ def smooth_modes(body: BodyModel, track: TrackedModes, choice: Smoothing) -> Smo
         if choice.lag is None:
             return _all_in_view(body, track, choice)
         return _with_lag(body, track, choice, choice.lag)
-    except torch.linalg.LinAlgError as error:  # a tracker's are positive definite
+    except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
         raise TrackFileError("a covariance of the track is none; it cannot be smoothed") from error
 
 
