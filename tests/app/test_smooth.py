@@ -304,6 +304,8 @@ def test_bad_choices_and_tracks_are_refused(body: BodyModel):
         Smoothing(lag=-1)
     with pytest.raises(TrackFileError, match="times"):
         smooth_track(track._replace(times=track.times[::-1].copy()))
+    with pytest.raises(TrackFileError, match="a covariance of the track is none"):
+        smooth_track(track._replace(covariance=-track.covariance))
     empty = TrackWriter("unused", Track.empty(body.state_names, body.joint_names, body=body))
     with pytest.raises(TrackFileError, match="no frames"):
         smooth_track(empty.track())

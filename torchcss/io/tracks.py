@@ -426,21 +426,7 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
     if (values["frames"] < 0).any() or (np.diff(values["frames"]) <= 0).any():
         raise TrackFileError(f"{path}: frames: expected numbers from 0 in rising order")
-    for name in ("state", "covariance", "joints_world", "base_transform"):
-        if max(values[name].max(initial=0), -values[name].min(initial=0)) > _LARGEST:
-            raise TrackFileError(f"{path}: {name}: expected numbers up to {_LARGEST:g}")
-    if (np.diagonal(values["covariance"], axis1=-2, axis2=-1) < 0).any():
-        raise TrackFileError(f"{path}: covariance: expected variances that are not negative")
-    if not np.linalg.det(values["base_transform"][:, :3, :3]).all():
-        raise TrackFileError(f"{path}: base_transform: expected a rotation and a place")
-    if (values["log_weight"] > _LARGEST_WEIGHT).any():
-        raise TrackFileError(f"{path}: log_weight: expected logarithms of weights, at most 1")
-    steps = np.abs(np.diff(values["times"]))
-    if (np.abs(values["times"]) > _LATEST_S).any() or ((steps > 0) & (steps < _SHORTEST_S)).any():
-        raise TrackFileError(
-            f"{path}: times: expected seconds, of frames at least {_SHORTEST_S:g} s apart and "
-            f"within {_LATEST_S:g} s of 0"
-        )
+    _check_numbers(values, path)
     if (empty := (values["log_weight"] == -np.inf).all(1)).any():
         raise TrackFileError(f"{path}: row {empty.argmax()}: no mode; expected one or more a frame")
     power = float(values.pop(_POWER_KEY))
@@ -460,6 +446,26 @@ _LARGEST_WEIGHT = 100.0
 
 _LATEST_S, _SHORTEST_S = 1e10, 1e-6
 """Seconds since 1970 are among the former; no camera is faster than the latter."""
+
+
+def _check_numbers(values: Mapping[str, np.ndarray], path: Path) -> None:
+    """Refuse what no tracker writes, and what would overflow further on."""
+    for name in ("state", "covariance", "joints_world", "base_transform"):
+        if max(values[name].max(initial=0), -values[name].min(initial=0)) > _LARGEST:
+            raise TrackFileError(f"{path}: {name}: expected numbers up to {_LARGEST:g}")
+    if (np.diagonal(values["covariance"], axis1=-2, axis2=-1) < 0).any():
+        raise TrackFileError(f"{path}: covariance: expected variances that are not negative")
+    if not np.linalg.det(values["base_transform"][:, :3, :3]).all():
+        raise TrackFileError(f"{path}: base_transform: expected a rotation and a place")
+    if (values["log_weight"] > _LARGEST_WEIGHT).any():
+        raise TrackFileError(f"{path}: log_weight: expected logarithms of weights, at most 1")
+    steps = np.abs(np.diff(values["times"]))
+    if (np.abs(values["times"]) > _LATEST_S).any() or ((steps > 0) & (steps < _SHORTEST_S)).any():
+        raise TrackFileError(
+            f"{path}: times: expected seconds, of frames at least {_SHORTEST_S:g} s apart and "
+            f"within {_LATEST_S:g} s of 0"
+        )
+
 
 _DESCRIBED = ("body", "cameras", "settings")
 
