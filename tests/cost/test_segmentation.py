@@ -29,7 +29,7 @@ from torchcss.initialise.view import CameraView
 from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, Observer
 from torchcss.types import Bounds, Frame, LocalModel
 from torchcss.vision.camera import Camera
-from torchcss.vision.features import FeatureExtractor
+from torchcss.vision.features import FeatureExtractor, Window
 from torchcss.vision.flow import TRACKING_FLOW
 
 
@@ -61,6 +61,21 @@ def test_it_is_the_sum_of_the_covered_pixels(batch: tuple[int, ...], dtype: torc
     assert got.dtype == dtype
     for value, state in zip(got.reshape(-1), x.reshape(-1, x.shape[-1]), strict=True):
         assert float(value) == pytest.approx(plain_twin(term, body, state, images), abs=1e-5)
+
+
+@pytest.mark.parametrize("reduction", [4, 7])
+def test_a_window_is_the_picture_that_is_zero_elsewhere(reduction: int) -> None:
+    """A body that is partly outside of it, and blocks that lie across its ends."""
+    body, camera = a_body_before_a_camera()
+    term, window = SegmentationTerm(reduction=reduction), Window(130, 121, 251, 403)
+    whole = painted(body, camera, body.rest)
+    part = torch.zeros_like(whole)
+    part[window.pixels] = whole[window.pixels]
+    layer, seen = layers(body)[1], whole[window.pixels]
+    in_window = term.images(seen, layer, camera, body, body.rest, window=window)
+    expected = term.images(part, layer, camera, body, body.rest)
+    x = torch.stack([moved(body, angle) for angle in (0.0, 0.9, 1.3)])
+    torch.testing.assert_close(term.value(body, x, in_window), term.value(body, x, expected))
 
 
 def test_the_painted_pose_is_the_cheapest() -> None:

@@ -340,6 +340,18 @@ def test_resized_camera_matches_a_resized_picture() -> None:
     )
 
 
+def test_cropped_camera_follows_the_image(generator: torch.Generator) -> None:
+    camera = make_camera(MILD)
+    points = torch.randn(50, 3, dtype=torch.float64, generator=generator) * 0.3
+    part = camera.cropped(30, -20, 50, 60)
+    assert part.image_size_wh == (50, 60)
+    away = torch.tensor([30.0, -20.0], dtype=torch.float64)
+    torch.testing.assert_close(part.project(points).uv, camera.project(points).uv - away)
+    assert part.name == camera.name
+    with pytest.raises(CameraError):
+        camera.cropped(0, 0, 0, 5)
+
+
 def test_own_frame_camera(generator: torch.Generator) -> None:
     camera = make_camera(MILD)
     own = camera.in_own_frame()

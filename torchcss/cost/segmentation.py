@@ -45,7 +45,7 @@ class SegmentationImages(NamedTuple):
     """What the pixels of a frame look like, reduced.
 
     Attributes:
-        camera: Camera of the reduced images.
+        camera: Camera of the reduced images: of the window, beyond which all is zero.
         ratio: How much each pixel looks like each layer, in -1..1; a last image of zeros stands
             for what is no part.
         layer: Layer of each part, and last that of no part.
@@ -124,7 +124,13 @@ class SegmentationTerm(Term):
         layer = functional.pad(layer_of_part, (0, 1), value=len(ratio))
         area = int((self._parts(body, expected, small) >= 0).sum())
         area = float(max(area, _FEWEST_PIXELS))
-        return SegmentationImages(small, reduced.to(body.tie), layer, area)
+        # Pixels beyond the window count nothing, and need not be drawn.
+        (width, height), (right, bottom) = camera.image_size_wh, small.image_size_wh
+        left, top = window.left * right // width, window.top * bottom // height
+        right, bottom = -(-window.right * right // width), -(-window.bottom * bottom // height)
+        here = small.cropped(left, top, right - left, bottom - top)
+        looks = reduced[:, top:bottom, left:right].to(body.tie).contiguous()
+        return SegmentationImages(here, looks, layer, area)
 
     def value(
         self, body: BodyModel, x: Float[Tensor, "*batch n"], images: SegmentationImages

@@ -532,6 +532,17 @@ class Camera(nn.Module):
         width, height = (max(1, round(side * factor)) for side in self.image_size_wh)
         return self.resized(width, height)
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """Return the camera of a rectangle of the image, by its first pixel and its size.
+
+        Raises:
+            CameraError: If the rectangle is empty.
+        """
+        size = _checked_image_size(self.name, (width, height))
+        K = self.K.clone()
+        K[:2, 2] -= K.new_tensor([left, top])
+        return self._like(K, size, self.R_camera_world, self.t_camera_world)
+
     def in_own_frame(self) -> Camera:
         """Return the camera at the origin of the world, its axes those of the world."""
         rotation = torch.eye(3, dtype=self.K.dtype, device=self.K.device)
