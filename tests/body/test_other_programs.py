@@ -181,7 +181,13 @@ def bvh(up: int = 1, motion: str = "MOTION\nFrames: 1\nFrame Time: 0.04\n{rows}\
     return text + motion.format(rows=rows)
 
 
-@pytest.mark.parametrize("motion", ["", "MOTION\nFrames: 0\nFrame Time: 0.0333\n"])
+@pytest.mark.parametrize(
+    "motion",
+    [
+        "",
+        *(f"MOTION\nFrames: 0\n{time}" for time in ("Frame Time: 0.0333\n", "Frame Time: 0\n", "")),
+    ],
+)
 def test_a_skeleton_without_motion(tmp_path: Path, motion: str) -> None:
     path = tmp_path / "a.bvh"
     path.write_text(bvh(motion=motion))
@@ -190,6 +196,8 @@ def test_a_skeleton_without_motion(tmp_path: Path, motion: str) -> None:
     assert any("no motion" in note for note in body.notes)
     with pytest.raises(MotionCaptureError, match="without motion"):
         read_motion_capture(path)
+    path.write_text(bvh().replace("0.04", "0"))  # of a single pose
+    assert read_motion_capture(path).frame_rate == 30
 
 
 @pytest.mark.parametrize("frames", [0, 2])

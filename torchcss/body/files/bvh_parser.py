@@ -53,6 +53,9 @@ class Segment(NamedTuple):
 # Numbers and places.
 
 
+_DEFAULT_RATE = 30.0
+"""Frames per second of a motion that has none, or one without a time."""
+
 _HUGE = 1e12
 """No length or angle of a body is so large, in any unit."""
 
@@ -164,7 +167,7 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
     while True:
         line = words.line
         if allowed == ("MOTION",) and words.at_end:
-            return segments, np.zeros((0, len(columns))), 30.0
+            return segments, np.zeros((0, len(columns))), _DEFAULT_RATE
         kind = words.keyword(*allowed, *(("ROOT",) if segments else ()))
         if kind == "ROOT" and segments:
             raise MotionCaptureError(
@@ -247,12 +250,20 @@ def _bvh_frames(
     path: Path, lines: list[Line], is_angle: np.ndarray
 ) -> tuple[Float[np.ndarray, "t c"], float]:
     """From MOTION on: the rows of numbers, angles in radians, and the frame rate."""
-    if len(lines) < 3:
+    if len(lines) < 2:
         raise bad(path, lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
-    first, second, rows = lines[1], lines[2], lines[3:]
-    number = whole_number(path, first.number, _said(path, first, "Frames"), "a number of frames")
+    number = whole_number(
+        path, lines[1].number, _said(path, lines[1], "Frames"), "a number of frames"
+    )
+    if number == 0 and len(lines) == 2:
+        return _table(path, [], is_angle), _DEFAULT_RATE
+    if len(lines) < 3:
+        raise bad(path, lines[1].number, "Frame Time: after it", "the end of the file")
+    second, rows = lines[2], lines[3:]
     digits = _said(path, second, "Frame Time").replace(",", ".")
     (interval,) = finite_numbers(path, second.number, [digits], "the seconds of a frame")
+    if interval == 0 and number < 2:
+        interval = 1 / _DEFAULT_RATE
     if not 1e-6 < interval < 1e3:
         raise bad(path, second.number, "the seconds of a frame", digits)
     if number != len(rows):
