@@ -316,14 +316,28 @@ def test_pictures_by_name(tmp_path: Path) -> None:
         read(path)
 
 
-def test_openpose_people_who_keep_their_place(tmp_path: Path) -> None:
-    nobody = np.full((17, 3), np.nan)
-    for t in T:
-        people = [nobody if t == 4 else person(t), nobody if t < 3 else person(t, shift=-150)]
+@pytest.mark.parametrize("absent", [np.nan, 0.0])
+def test_people_who_keep_their_place(tmp_path: Path, absent: float) -> None:
+    """Pose2Sim's of a video, and arrays of tracked people."""
+    nobody = np.full((17, 3), absent)
+    frames = [
+        [nobody if t == 4 else person(t), nobody if t < 3 else person(t, shift=-150)] for t in T
+    ]
+    for t, people in enumerate(frames):
         content = {"people": [{"person_id": [-1], "pose_keypoints_2d": p.ravel().tolist()}
                               for p in people]}  # fmt: skip
-        write(tmp_path / f"{t}.json", content)
-    check(read(tmp_path), (4,))
+        write(tmp_path / "json" / f"{t}.json", content)
+    check(read(tmp_path / "json"), (4,))
+    np.save(tmp_path / "a.npy", np.array(frames))
+    check(read(tmp_path / "a.npy"), (4,))
+
+
+def test_people_before_what_fills_up_an_array(tmp_path: Path) -> None:
+    """The best first, whoever it is."""
+    frames = [[person(t), other(t), nobody := np.zeros((17, 3)), nobody] for t in T]
+    frames[2] = [other(2), person(2), nobody, nobody]
+    np.save(tmp_path / "a.npy", np.array(frames))
+    check(read(tmp_path / "a.npy"))
 
 
 def test_coco_with_two_skeletons(tmp_path: Path) -> None:

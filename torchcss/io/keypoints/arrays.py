@@ -35,6 +35,7 @@ from torchcss.io.keypoints.people import (
     People,
     Person,
     is_there,
+    keep_places,
     screened,
 )
 from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SHAPES, SIDES, SIZES, first_of
@@ -92,7 +93,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
     values, told = _with_confidence(name, values, first_of(arrays, SCORES))
-    tracks = _tracks(arrays.get("person_ids"), values.shape[1])
+    tracks = _tracks(arrays.get("person_ids"), values)
     people = [
         [
             Person(joints, track)
@@ -184,7 +185,11 @@ def _unfit(name: str, array: np.ndarray, expected: str) -> KeypointError:
     return KeypointError(f"{name}: expected {expected}, got {got}")
 
 
-def _tracks(ids: np.ndarray | None, count: int) -> list[str | None]:
+def _tracks(ids: np.ndarray | None, values: np.ndarray) -> list[str | None]:
+    """Whom the places of the second axis are, where the file says so or they keep them."""
+    count = values.shape[1]
+    if ids is None and count > 1 and keep_places([*frame] for frame in values):
+        ids = np.arange(count)
     if ids is None:
         return [None] * count
     if ids.shape != (count,) or ids.dtype.kind not in "iuU":

@@ -45,8 +45,8 @@ from torchcss.io.keypoints.people import (
     People,
     Person,
     Size,
-    is_there,
     joint_counts,
+    keep_places,
     number_array,
     one_size,
     united,
@@ -165,9 +165,7 @@ def read_folder(path: Path) -> People:
 
 def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = False) -> People:
     """People of a format; 33 joints are MediaPipe's, whatever they are called or how ordered."""
-    everyone = [person for people in frames.values() for person in people]
-    if not all(is_there(person.joints) for person in everyone):
-        # Who is not in a frame keeps his place there (Pose2Sim's): the place says who it is.
+    if keep_places([person.joints for person in people] for people in frames.values()):
         for people in frames.values():
             people[:] = [p._replace(track=p.track or f"{n}") for n, p in enumerate(people)]
     frames, names = reordered(frames, names or ())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -157,7 +157,21 @@ def screened(
 
 def is_there(joints: Float[np.ndarray, "j 3"]) -> bool:
     """Whether a person is there at all: someone whose joints are all NaN or zero is nobody."""
-    return bool((np.nan_to_num(joints[:, 2]) > 0).any() or np.isfinite(joints[:, :2]).any())
+    places = np.nan_to_num(joints[:, :2], posinf=1.0, neginf=1.0)
+    return bool((np.nan_to_num(joints[:, 2]) > 0).any() or places.any())
+
+
+def keep_places(frames: Iterable[Sequence[Float[np.ndarray, "j 3"]]]) -> bool:
+    """Whether the place in a frame says who somebody is, as Pose2Sim and tracked arrays have it.
+
+    Then who is not there is NaN, or zeros before somebody else; zeros at the end fill up an array.
+    """
+    for people in frames:
+        there = [is_there(joints) for joints in people]
+        gone = there.index(False) if False in there else len(there)
+        if any(there[gone:]) or any(np.isnan(joints[:, :2]).all() for joints in people[gone:]):
+            return True
+    return False
 
 
 def track_of(entry: Mapping[str, object], names: Sequence[str] = TRACKS) -> str | None:
