@@ -806,6 +806,11 @@ def test_tracks_of_the_file_win_over_nearness(tmp_path: Path) -> None:
     u = found.positions[:, 0, 0]
     np.testing.assert_allclose(u, [120 + 83 * t for t in T])
     assert any("'7' of the file" in line for line in found.report)
+    for word in ("person_id", "instance_id", "trackId"):
+        marks = [{"id": n, "image_id": each["image_id"], "keypoints": each["keypoints"],
+                  "attributes": {word: each["idx"]}} for n, each in enumerate(entries)]  # fmt: skip
+        again = read(write(tmp_path / "b.json", {"annotations": marks}))
+        np.testing.assert_array_equal(again.positions, found.positions)
 
 
 def cvat_point(name: str | None, row: np.ndarray, more: str = "") -> str:

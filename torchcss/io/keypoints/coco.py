@@ -21,8 +21,12 @@ from torchcss.io.keypoints.people import (
     one_size,
     track_of,
 )
+from torchcss.io.keypoints.words import TRACKS
 from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
+
+_TRACKS = tuple(word for word in TRACKS if word != "id")
+"""Words for a track; `id` numbers the detections."""
 
 
 def read_coco(content: Mapping[str, Any]) -> People:
@@ -41,7 +45,7 @@ def read_coco(content: Mapping[str, Any]) -> People:
         # COCO also annotates things that have no joints, and other skeletons.
         if "keypoints" in entry and category in (None, entry.get("category_id")):
             about = entry.get("attributes")
-            track = track_of({**entry, **(about if isinstance(about, dict) else {})}, ("trackid",))
+            track = track_of({**entry, **(about if isinstance(about, dict) else {})}, _TRACKS)
             people = one_person(where, entry["keypoints"], entry)
             found.setdefault(image, []).extend(person._replace(track=track) for person in people)
     if "images" not in content:
