@@ -1935,3 +1935,23 @@ def test_numbers_of_pictures_with_a_decimal_point(tmp_path: Path) -> None:
     images[1]["file_name"] = "0.png"
     with pytest.raises(KeypointError, match="an id and file_name of their own each"):
         read(write(path, {"images": images, "annotations": marks}))
+
+
+def test_openposes_first_file_is_lost(tmp_path: Path) -> None:
+    """Its own names count from 0; others may be those of pictures that count from 1."""
+    for t in T[1:]:
+        people = {"people": [{"pose_keypoints_2d": flat(t)}]}
+        write(tmp_path / "a" / f"clip_{t:012d}_keypoints.json", people)
+        write(tmp_path / "b" / f"img_{t + 1:04d}.json", people)
+        write(tmp_path / "c" / f"clip_{t:012d}_keypoints.json", people)
+        write(tmp_path / "c" / f"clip_{6:012d}_keypoints.json", people)
+    for name in "ab":
+        check(read(tmp_path / name, first_frame=1), (0,))
+    assert "frame 1 is the first frame" in read(tmp_path / "c").report
+
+
+def test_the_path_of_a_picture(tmp_path: Path) -> None:
+    frames = [{"img_path": f"/a/img_{100 + t}.jpg", "people": [{"keypoints": flat(t)}]}
+              for t in SEEN]  # fmt: skip
+    path = write(tmp_path / "a.json", frames)
+    check(read(path, frame_names=[f"img_{100 + t}.jpg" for t in T]), (3,))

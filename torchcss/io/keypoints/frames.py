@@ -190,9 +190,10 @@ def _first(people: People, places: Sequence[int], num_frames: int | None) -> int
     """Which number the first frame has."""
     low, high = min(places, default=0), max(places, default=0)
     # Numbers from the midst of the video are its own: of the frames that somebody looked at.
-    within = num_frames is not None and 1 < low <= high < num_frames
+    within = num_frames is not None and 1 < low <= high <= num_frames
     if not places or (people.whole and not within):
-        return low
+        lost = people.first == 0 and low == 1 and high < (num_frames or 0)  # the first of all
+        return 0 if lost else low
     if num_frames is not None and high - low + 1 == num_frames and low > 1:
         return low
     if num_frames is not None and low > num_frames:

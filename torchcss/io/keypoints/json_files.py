@@ -159,8 +159,9 @@ def read_folder(path: Path) -> People:
     frames, names = united(found)
     names = names or _said_names(contents[0], frames)
     people = _people(f"{name}, {len(files)} files", frames, names)
-    # A labelled picture has a file; of a video every frame has one.
-    return people._replace(whole=name != "labelme", size_wh=size)
+    # A labelled picture has a file; of a video every frame has one. OpenPose's names count from 0.
+    first = 0 if re.search("_[0-9]{12}_keypoints.json$", files[0].name) else None
+    return people._replace(whole=name != "labelme", size_wh=size, first=first)
 
 
 def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = False) -> People:

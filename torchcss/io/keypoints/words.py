@@ -33,7 +33,8 @@ TIMES: dict[str, float | None] = {
 """A time, and its unit in seconds, where the word says it."""
 
 PICTURES = names_in(
-    "imageid filename image imagename imgname imagepath imagefile img file framename picture"
+    "imageid filename image imagename imgname imagepath imgpath imagefile img file filepath "
+    "framename picture"
 )
 """The name of a frame's picture."""
 
