@@ -914,8 +914,11 @@ def test_sides_of_a_pair(tmp_path: Path) -> None:
 
 def test_a_message_of_ros_ends_by_a_line(tmp_path: Path) -> None:
     text = f"width: 640\nheight: 480\nk: {np.ravel(K).tolist()}\nd: {LENS}\n---\n"
-    (tmp_path / "a.yaml").write_text(2 * text)
+    (tmp_path / "a.yaml").write_text(f"header: {{seq: 1}}\n{text}header: {{seq: 2}}\n{text}")
     check(tmp_path / "a.yaml")
+    (tmp_path / "a.yaml").write_text(text + text.replace("640", "320"))
+    with pytest.raises(CameraError, match="several cameras"):
+        load_camera(tmp_path / "a.yaml")
 
 
 def test_colmaps_folders_and_matrices_in_other_files(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ import tomllib
 import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -1098,13 +1099,22 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 
 
+def _camera_of(document: object) -> dict[str, Any]:
+    """What a document says of a camera, but for when."""
+    whole = document if isinstance(document, dict) else {}
+    return {str(key): value for key, value in whole.items() if key != "header"}
+
+
 def _load(path: Path) -> dict[str, Any]:
     if len(text := read_text(path, CameraError)) > _MOST_YAML:
         raise CameraError(f"{path}: more than {_MOST_YAML:,} bytes; not a calibration")
     if text.startswith("%YAML:1.0"):
         text = text.partition("\n")[2]
     with refusing(CameraError, f"{path}: cannot be read as YAML"):
-        content = next(yaml.load_all(text, Loader=_Loader), None)  # ROS ends messages by ---
+        # ROS ends a message by ---, and may say it again under another time.
+        content, *others = [*islice(yaml.load_all(text, Loader=_Loader), 2)] or [None]
+    if any(_camera_of(each) not in ({}, _camera_of(content)) for each in others):
+        raise CameraError(f"{path}: several cameras, one after the other; give each its own file")
     if not isinstance(content, dict):
         raise CameraError(
             f"{path}: no calibration; expected names, camera_matrix or cam0, found "
