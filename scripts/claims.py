@@ -16,7 +16,8 @@ tracker and against the order in which trackers fail, not against a time.
 
 A run has *failed* once it has lost the body, or one limb in the mode nearest to the truth
 (`torchcss.studies.evaluation`); a tracker fails where most of its seeds do, and lasts longer than
-another where its median time does. A claim for which no report is given is not tested.
+another where its median time does, and is far better where that is twice as long. A claim for which
+no report is given is not tested.
 """
 
 from __future__ import annotations
@@ -200,12 +201,14 @@ def tracks(evidence: Evidence, sequence: str, preset: str) -> Finding:
     )
 
 
-def outlasts(evidence: Evidence, sequence: str, better: str, worse: str) -> Finding:
-    """A tracker fails later than another."""
+def outlasts(
+    evidence: Evidence, sequence: str, better: str, worse: str, times: float = 1.0
+) -> Finding:
+    """A tracker fails later than another, or after so many times as long."""
     one, two = evidence.of(sequence, better), evidence.of(sequence, worse)
     return Finding(
         f"{better}: {told(one)}; {worse}: {told(two)}",
-        median(map(failed_s, one)) > median(map(failed_s, two)),
+        median(map(failed_s, one)) > times * median(map(failed_s, two)),
     )
 
 
@@ -673,9 +676,9 @@ CLAIMS: tuple[Claim, ...] = (
     Claim("at large scale there are few spurious minima", "[IJRR] Fig. 8, [RR] 4.2",
           SLICES, by(few_minima, "far", 3)),
     Claim("CSS is far better than noise of the dynamics (body before clutter)", "[IJRR] 9",
-          FAILURES, by(outlasts, CLUTTER, "ijrr_css", "ijrr_cham_rehg")),
+          FAILURES, by(outlasts, CLUTTER, "ijrr_css", "ijrr_cham_rehg", times=2)),
     Claim("CSS is far better than noise of the dynamics (body in the dark)", "[IJRR] 9",
-          FAILURES, by(outlasts, DARK, "ijrr_css", "ijrr_cham_rehg")),
+          FAILURES, by(outlasts, DARK, "ijrr_css", "ijrr_cham_rehg", times=2)),
     Claim("weighing contours by foreground and motion boundaries improves much", "[IJRR] 8",
           FAILURES, weights_help),
     Claim("stabilisers hold what is hard to estimate", "[IJRR] 3.2.2, 6.2",
