@@ -183,6 +183,14 @@ def test_matlab(tmp_path: Path, form: str) -> None:
         check(tmp_path / "a.json")
 
 
+@pytest.mark.parametrize("text", ["\n", "a = [\n", "a = [ 1 ;\n", "a = 1 ", " "])
+def test_a_script_of_a_stranger_is_looked_at_once(tmp_path: Path, text: str) -> None:
+    """Looked at anew from each line, these would take hours."""
+    (tmp_path / "a.m").write_text(200_000 * text)
+    with pytest.raises(CameraError, match="expected a calibration"):
+        load_camera(tmp_path / "a.m")
+
+
 def test_bouguets_toolbox(tmp_path: Path) -> None:
     values = {"fc": [[FX], [FY]], "cc": [[CX], [CY]], "kc": np.array(LENS)[:, None], "nx": 640}
     savemat(tmp_path / "Calib_Results.mat", {**values, "ny": 480})

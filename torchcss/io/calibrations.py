@@ -852,10 +852,11 @@ def _read_matlab(path: Path) -> dict[str, Entry]:
 
 def _read_bouguet(path: Path) -> dict[str, Entry]:
     """What Bouguet's toolbox saves as a script: `fc = [ 657.4 ; 657.8 ];`."""
-    text = re.sub(r"(?m)%.*$", "", read_text(path, CameraError))
-    found = re.findall(r"(?m)^\s*(\w+)\s*=\s*\[?([-+0-9.eE;,\s]+)\]?\s*;", text)
-    with refusing(CameraError, f"{path}: not a script of numbers"):
-        lists = {name: [float(n) for n in re.split(r"[;,\s]+", row) if n] for name, row in found}
+    text, lists = re.sub(r"%.*", "", read_text(path, CameraError)), {}
+    # A list ends before the next one begins, and no line is looked at twice.
+    for name, said in re.findall(r"(?m)^[ \t]*(\w+)[ \t]*=[ \t]*(\[[^][=]*\]|[^;\n]*)", text):
+        with suppress(ValueError):  # a word, or a call
+            lists[name] = [float(number) for number in re.split(r"[][;,\s]+", said) if number]
     return _alone(
         path, {name: each if each[1:] else each[0] for name, each in lists.items() if each}
     )
@@ -1113,13 +1114,13 @@ def _load(path: Path) -> dict[str, Any]:
     with refusing(CameraError, f"{path}: cannot be read as YAML"):
         # ROS ends a message by ---, and may say it again under another time.
         content, *others = [*islice(yaml.load_all(text, Loader=_Loader), 2)] or [None]
-    if any(_camera_of(each) not in ({}, _camera_of(content)) for each in others):
-        raise CameraError(f"{path}: several cameras, one after the other; give each its own file")
     if not isinstance(content, dict):
         raise CameraError(
             f"{path}: no calibration; expected names, camera_matrix or cam0, found "
             f"{shortened(content)}"
         )
+    if any(_camera_of(each) not in ({}, _camera_of(content)) for each in others):
+        raise CameraError(f"{path}: several cameras, one after the other; give each its own file")
     # ORB-SLAM's have a common word before each.
     return {re.sub(r"^Camera1?\.", "", str(key)): value for key, value in content.items()}
 
