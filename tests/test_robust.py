@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from torchcss.errors import ConfigurationError
-from torchcss.robust import Leclerc, Lorentzian, Quadratic, RobustPotential
+from torchcss.robust import Charbonnier, Leclerc, Lorentzian, Quadratic, RobustPotential
 
-KINDS = [Quadratic, Lorentzian, Leclerc]
+KINDS = [Quadratic, Lorentzian, Charbonnier, Leclerc]
 POTENTIALS = [kind(nu=1.7, sigma=0.6) for kind in KINDS]
-MOST = {Quadratic: math.inf, Lorentzian: math.inf, Leclerc: 1.7}
+MOST = {Quadratic: math.inf, Lorentzian: math.inf, Charbonnier: math.inf, Leclerc: 1.7}
 PROBES = [0.0, 1e-12, 1e-4, 0.1, 0.36, 1.0, 2.999, 3.001, 50.0, 1e4, 1e8]
 
 
@@ -83,6 +83,24 @@ def test_kornia_agrees(generator: torch.Generator) -> None:
         Leclerc(sigma=root_two)(residual.square()).rho,
         kornia.losses.welsch_loss(residual, zero, reduction="none"),
     )
+    torch.testing.assert_close(
+        Charbonnier(nu=0.5, power=0.5)(residual.square()).rho,
+        kornia.losses.charbonnier_loss(residual, zero, reduction="none"),
+    )
+
+
+def test_charbonnier_lies_between_its_neighbours() -> None:
+    s = torch.tensor(PROBES, dtype=torch.float64)
+    for power, neighbour in ((1.0, Quadratic), (1e-3, Lorentzian)):
+        got, expected = (
+            Charbonnier(nu=1.7, sigma=0.6, power=power)(s),
+            neighbour(nu=1.7, sigma=0.6)(s),
+        )
+        torch.testing.assert_close(got.rho, expected.rho, rtol=0.02, atol=0)
+        torch.testing.assert_close(got.first, expected.first, rtol=0.03, atol=0)
+    for power in (0.0, 1.1, math.nan):
+        with pytest.raises(ConfigurationError, match="power"):
+            Charbonnier(power=power)
 
 
 @pytest.mark.parametrize("kind", KINDS)

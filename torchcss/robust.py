@@ -12,6 +12,7 @@ outliers nu. They differ in what a large residual costs.
 |---|---|---|
 | `Quadratic` | nu z (Gaussian errors) | never |
 | `Lorentzian` | nu log(1 + z) | never, but only logarithmically |
+| `Charbonnier` | nu ((1 + z)^a - 1) / a, 0 < a < 1 | never, but more slowly than `Quadratic` |
 | `Leclerc` | nu (1 - exp(-z)) | nu |
 
 The cost, half of rho, reaches nu / 2 at most with `Leclerc`. Eq. 5 [IJRR] counts a node that faces
@@ -102,6 +103,34 @@ class Lorentzian(RobustPotential):
         inverse = (s + variance).reciprocal()
         first = self.nu * inverse
         return RobustValue(self.nu * torch.log1p(s / variance), first, -first * inverse)
+
+
+@frozen
+class Charbonnier(RobustPotential):
+    """The generalised Charbonnier potential, rho = nu ((1 + s / sigma^2)^a - 1) / a.
+
+    Between `Lorentzian`, its limit for a = 0, and `Quadratic`, a = 1; with a = 1/2 it is the one of
+    Charbonnier et al. (1994). Sun, Roth and Black (2010) find a = 0.45 best for optical flow.
+
+    Attributes:
+        nu: Spread of the outliers, here a mere factor.
+        sigma: Scale of the central peak in the unit of the weighted residual.
+        power: The power a, between 0 and 1.
+    """
+
+    power: float = 0.45
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "power", least=1e-3, most=1.0)
+
+    def __call__(self, s: Numbers) -> RobustValue:
+        """Evaluate at squared weighted errors."""
+        variance, power = self.sigma**2, self.power
+        growth = torch.log1p(s / variance)
+        first = (self.nu / variance) * torch.exp((power - 1) * growth)
+        second = (power - 1) * first / (s + variance)
+        return RobustValue(self.nu / power * torch.expm1(power * growth), first, second)
 
 
 @frozen

@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from torchcss.errors import FlowFileError, check_shape
 from torchcss.files import read_bytes
-from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.robust import Charbonnier, Leclerc, Lorentzian, Quadratic
 from torchcss.vision.flow import FlowConfiguration
 
 _MAGIC = b"PIEH"
@@ -133,7 +133,8 @@ def _filled(
 
 
 def with_potentials(
-    configuration: FlowConfiguration, kind: type[Quadratic] | type[Lorentzian] | type[Leclerc]
+    configuration: FlowConfiguration,
+    kind: type[Quadratic] | type[Lorentzian] | type[Leclerc] | type[Charbonnier],
 ) -> FlowConfiguration:
     """The same choices with both potentials of another kind, nu and sigma kept."""
     data, smoothness = (

@@ -23,9 +23,12 @@ rng, single = np.random.default_rng(0), np.float32
 
 for size in ((1, 1), (3, 4), (9, 1)):
     moves = (20 * rng.standard_normal((2, *size))).astype(single)
-    first, second = rng.random((2, 3, *size)).astype(single)
+    first = rng.random((3, *size)).astype(single)
+    spline = np.zeros((size[0] + 3, size[1] + 3), single)
+    run(flow_kernels.spline, first[0], np.zeros(max(size), single), spline)
+    run(flow_kernels.slopes, spline, *first[1:])
     found = np.zeros((2, *size), single), *np.zeros((2, *size), single)
-    run(flow_kernels.linearise, moves, first, second, 1e-10, *found)
+    run(flow_kernels.linearise, moves, first, spline, 1e-10, *found)
 
 for height, width, y, x in ((7, 5, 3, 2), (9, 9, 8, 8), (50, 3, 7, 1), (33, 64, 32, 63)):
     pixels = torch.from_numpy(rng.integers(0, 255, (height, width, 3)).astype(np.uint8))

@@ -13,12 +13,14 @@ import torch
 from common.flow_files import flow_discontinuities, read_flow, with_potentials
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
-from torchcss.robust import Leclerc, Lorentzian, Quadratic
+from torchcss.robust import Charbonnier, Leclerc, Lorentzian, Quadratic
 from torchcss.vision import flow as module
+from torchcss.vision import warping
 from torchcss.vision.flow import (
     ACCURATE,
     TRACKING_FLOW,
@@ -27,7 +29,7 @@ from torchcss.vision.flow import (
     robust_flow,
 )
 
-KINDS = (Lorentzian, Leclerc, Quadratic)
+KINDS = (Lorentzian, Leclerc, Charbonnier, Quadratic)
 
 
 def texture(u: Tensor, v: Tensor, seed: int = 0) -> Tensor:
@@ -87,7 +89,7 @@ def assert_sound(result: OpticalFlow, shape: tuple[int, ...]) -> None:
 def test_solver_reaches_the_dense_solution(generator: torch.Generator) -> None:
     height, width = 5, 6
     sizes = {"generator": generator, "dtype": torch.float64}
-    constancy = module._Constancy(
+    constancy = warping.Constancy(
         torch.randn(1, 2, height, width, **sizes),
         torch.randn(1, 1, height, width, **sizes),
         torch.ones(1, 1, height, width),
@@ -100,7 +102,7 @@ def test_solver_reaches_the_dense_solution(generator: torch.Generator) -> None:
     def energy(flat: Tensor) -> Tensor:
         flow = flat.view(1, 2, height, width)
         return (
-            (weight * module._residual(constancy, flow).square()).sum()
+            (weight * constancy.residual(flow).square()).sum()
             + (right * flow.diff(dim=-1).square()).sum()
             + (down * flow.diff(dim=-2).square()).sum()
         )
@@ -158,24 +160,60 @@ def test_weighted_median_against_a_loop(generator: torch.Generator) -> None:
                 assert float(found[0, axis, row, column]) == values[order][middle]
 
 
-def test_gradient_is_exact_on_quartics() -> None:
-    u, v = grid(9, 9)
-    u, v = u - 4.0, v - 4.0
-    image = u**4 - 2.0 * u**3 * v + v**4 - v
-    expected = torch.stack([4.0 * u**3 - 6.0 * u**2 * v, -2.0 * u**3 + 4.0 * v**3 - 1.0])
-    found = module._gradient(image[None, None])[0]
-    torch.testing.assert_close(found[:, 2:-2, 2:-2], expected[:, 2:-2, 2:-2])
+def test_spline_against_scipy(generator: torch.Generator) -> None:
+    """Values and slopes between the pixels; scipy's natural spline, one axis after the other."""
+    image = torch.rand(1, 1, 7, 9, generator=generator, dtype=torch.float64)
+    flow = 2 * torch.rand(1, 2, 7, 9, generator=generator, dtype=torch.float64) - 1
+    for line in (flow[0, 0, :, 0], flow[0, 1, 0]):
+        line.abs_()
+    for line in (flow[0, 0, :, -1], flow[0, 1, -1]):
+        line.abs_().neg_()
+    value, slope, visible = warping._sampled(warping.image_spline(image), flow)
+    assert visible.all()
+    across = CubicSpline(np.arange(7), image[0, 0].numpy(), bc_type="natural")
+    for row, column in np.ndindex(7, 9):
+        u, v = column + float(flow[0, 0, row, column]), row + float(flow[0, 1, row, column])
+        along = CubicSpline(np.arange(9), across(v), bc_type="natural")
+        upwards = CubicSpline(np.arange(9), across(v, 1), bc_type="natural")
+        assert float(value[0, 0, row, column]) == pytest.approx(float(along(u)), abs=1e-12)
+        expected = [float(along(u, 1)), float(upwards(u))]
+        assert slope[0, :, row, column].tolist() == pytest.approx(expected, abs=1e-12)
+
+
+def test_slopes_are_those_of_the_spline(generator: torch.Generator) -> None:
+    spline = warping.image_spline(torch.rand(1, 1, 7, 9, generator=generator))
+    _, expected, _ = warping._sampled(spline, torch.zeros(1, 2, 7, 9))
+    torch.testing.assert_close(warping.image_slopes(spline), expected, atol=1e-5, rtol=0)
 
 
 def test_sampling_at_whole_pixels(generator: torch.Generator) -> None:
     image = torch.rand(1, 1, 7, 9, generator=generator)
     flow = torch.zeros(1, 2, 7, 9)
     flow[:, 0], flow[:, 1] = 2.0, -1.0
-    sampled, visible = module._sample(image, flow)
+    sampled, _, visible = warping._sampled(warping.image_spline(image), flow)
     torch.testing.assert_close(sampled[..., 1:, :-2], image[..., :-1, 2:], atol=1e-5, rtol=0)
     assert visible[0, 0, 1:, :-2].all()
     assert not visible[0, 0, 0].any()
     assert not visible[0, 0, :, -2:].any()
+
+
+@pytest.mark.parametrize("deviation", [0.0, 2.0, 6.0])
+def test_noise_is_taken_out_and_nothing_else(deviation: float, generator: torch.Generator) -> None:
+    u, v = grid(80, 100)
+    frames = torch.stack([texture(u / 4, v / 4, seed).float() for seed in (1, 2)])[None]
+    noise = deviation / 255 * torch.randn(frames.shape, generator=generator)
+    cleaned = module._without_noise(frames + noise)
+    if deviation:
+        assert (cleaned - frames).std() < 0.6 * noise.std()
+    else:
+        assert torch.equal(cleaned, frames)
+
+
+def test_structure_does_not_bend_at_the_border() -> None:
+    """A slope is all structure, to the border."""
+    slope = torch.linspace(0.2, 0.8, 40).expand(1, 2, 30, 40)
+    left = slope - module._structure_of_wider(slope)
+    assert left[..., :3].abs().max() < 0.2 * (slope - module._structure(slope))[..., 0].abs().max()
 
 
 def test_structure_keeps_the_mean_and_has_less_variation(generator: torch.Generator) -> None:
@@ -242,6 +280,17 @@ def test_motion_of_a_tenth_of_the_frame(configuration: FlowConfiguration) -> Non
         robust_flow(first, second, configuration).flow, torch.tensor([12.0, -5.0]).view(2, 1, 1)
     )
     assert error[8:-8, 8:-16].mean() < 0.05
+
+
+@pytest.mark.parametrize("configuration", [ACCURATE, TRACKING_FLOW])
+def test_light_that_changes(configuration: FlowConfiguration) -> None:
+    """Also on smooth texture and along the border, where texture alone says little."""
+    u, v = grid(60, 81)
+    first, second = (texture(u / 3 - move, v / 3, 4) for move in (0.0, 0.5))
+    second = (1.05 * second + 0.04 * u / 81 - 0.02).clamp(0.0, 1.0)
+    result = robust_flow(first.float(), second.float(), configuration)
+    error = end_point_error(result.flow, torch.tensor([1.5, 0.0]).view(2, 1, 1))
+    assert error[:, :-3].mean() < 0.2
 
 
 def test_what_leaves_the_view_is_an_outlier() -> None:

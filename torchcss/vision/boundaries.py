@@ -35,8 +35,9 @@ from torch import Tensor
 
 from torchcss.errors import ShapeError
 from torchcss.kernels.checked import run
-from torchcss.vision.flow import OpticalFlow, has_flow_kernels
+from torchcss.vision.flow import OpticalFlow
 from torchcss.vision.sampling import gaussian_blur
+from torchcss.vision.warping import has_flow_kernels
 
 Images = Float[Tensor, "*batch h w"]
 

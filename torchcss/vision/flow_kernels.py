@@ -13,91 +13,135 @@ from torchcss.kernels.compiler import entry, floor, inlined, sqrt
 
 
 @inlined
-def _near(t):  # type: ignore[no-untyped-def]
-    """Cubic convolution with the slope -3/4 at one, at a distance up to one."""
-    return (1.25 * t - 2.25) * t * t + 1.0
-
-
-@inlined
-def _far(t):  # type: ignore[no-untyped-def]
-    """The same at a distance from one to two."""
-    return ((-0.75 * t + 3.75) * t - 6.0) * t + 3.0
+def _go_on(line, num):  # type: ignore[no-untyped-def]
+    """Continue the coefficients of a line, which begin at its second number, straight on."""
+    line[0] = 2.0 * line[1] - line[2] if num > 1 else line[1]
+    line[num + 1] = 2.0 * line[num] - line[num - 1] if num > 1 else line[num]
+    line[num + 2] = line[num + 1]
 
 
 @entry
-def gradient(image, row, along_u, along_v):  # type: ignore[no-untyped-def]
-    """Derivatives of an image, its border replicated; see `torchcss.vision.flow._gradient`.
+def spline(image, factors, coefficients):  # type: ignore[no-untyped-def]
+    """Coefficients of the natural cubic spline through an image; Thomas' algorithm, twice.
 
     Args:
         image: `[h w]`, single precision.
-        row: Memory for a row and two pixels on either side, `[w+4]`.
-        along_u: Becomes the derivative along u, `[h w]`.
-        along_v: Becomes the derivative along v, `[h w]`.
+        factors: Memory, as long as the longer side.
+        coefficients: Becomes those of a row before the image, of its own, and of two behind it, and
+            as many columns, `[h+3 w+3]`.
     """
     height, width = image.shape
-    middle = row[2 : width + 2]
-    for y in range(height):
-        source = image[y]
+    factors[0] = 0.0
+    for k in range(1, len(factors)):
+        factors[k] = 1.0 / (4.0 - factors[k - 1])
+    for row in range(height):
+        source, to, factor = image[row], coefficients[row + 1, 1 : width + 1], factors[row]
+        above = coefficients[row, 1 : width + 1]
+        if row == 0 or row == height - 1:
+            for c in range(width):
+                to[c] = source[c]
+        else:
+            for c in range(width):
+                to[c] = (6.0 * source[c] - above[c]) * factor
+    for row in range(height - 2, 0, -1):
+        to, below = coefficients[row + 1, 1 : width + 1], coefficients[row + 2, 1 : width + 1]
+        factor = factors[row]
         for c in range(width):
-            middle[c] = source[c]
-        row[0] = row[1] = source[0]
-        row[width + 2] = row[width + 3] = source[width - 1]
-        _differences(row[:width], row[1:], row[3:], row[4:], along_u[y])
-        above, farther = image[max(y - 1, 0)], image[max(y - 2, 0)]
-        below, farthest = image[min(y + 1, height - 1)], image[min(y + 2, height - 1)]
-        _differences(farther, above, below, farthest, along_v[y])
+            to[c] -= factor * below[c]
+    for row in range(1, height + 1):
+        line = coefficients[row]
+        for c in range(2, width):
+            line[c] = (6.0 * line[c] - line[c - 1]) * factors[c - 1]
+        for c in range(width - 1, 1, -1):
+            line[c] -= factors[c - 1] * line[c + 1]
+        _go_on(line, width)
+    for c in range(width + 3):
+        _go_on(coefficients[:, c], height)
+
+
+@entry
+def slopes(coefficients, along_u, along_v):  # type: ignore[no-untyped-def]
+    """Slopes of a spline at its pixels.
+
+    Args:
+        coefficients: As `spline` finds them, `[h+3 w+3]`.
+        along_u: Becomes the slope along u, `[h w]`.
+        along_v: Becomes the slope along v, `[h w]`.
+    """
+    height, width = along_u.shape
+    share = np.float32(1 / 12)
+    for row in range(height):
+        above, line, below = coefficients[row], coefficients[row + 1], coefficients[row + 2]
+        to_u, to_v = along_u[row], along_v[row]
+        for c in range(width):
+            left = above[c] + 4.0 * line[c] + below[c]
+            right = above[c + 2] + 4.0 * line[c + 2] + below[c + 2]
+            to_u[c] = (right - left) * share
+            upper = above[c] + 4.0 * above[c + 1] + above[c + 2]
+            lower = below[c] + 4.0 * below[c + 1] + below[c + 2]
+            to_v[c] = (lower - upper) * share
 
 
 @inlined
-def _differences(first, second, fourth, fifth, into):  # type: ignore[no-untyped-def]
-    """Derivatives at the third of five points, exact for polynomials of degree four."""
-    for c in range(len(into)):
-        into[c] = (8.0 * (fourth[c] - second[c]) + first[c] - fifth[c]) * (1.0 / 12.0)
+def _ends(t):  # type: ignore[no-untyped-def]
+    """Share and slope of the coefficient two pixels off, a place t beyond one pixel off."""
+    return t * t * t * np.float32(1 / 6), np.float32(0.5) * t * t
+
+
+@inlined
+def _middle(t):  # type: ignore[no-untyped-def]
+    """Share and slope of a coefficient, at a distance of up to one pixel behind it."""
+    share = ((np.float32(0.5) * t - np.float32(1)) * t * t) + np.float32(2 / 3)
+    return share, (np.float32(1.5) * t - np.float32(2)) * t
 
 
 @entry
 def linearise(flow, first, second, least, gradient, offset, visible):  # type: ignore[no-untyped-def]
-    """Warp the second frame and linearise constant brightness, see `torchcss.vision.flow`.
+    """Warp the second frame and linearise constant brightness, see `torchcss.vision.warping`.
 
     Args:
         flow: `[2 h w]`, single precision, finite.
-        first: Grey levels of the first frame and their gradient, `[3 h w]`.
-        second: The same of the second frame.
+        first: Grey levels of the first frame and their slopes, `[3 h w]`.
+        second: Spline through the second frame, `[h+3 w+3]`.
         least: Square of the least gradient that is not rounding.
         gradient: Becomes the mean of both frames' gradients, `[2 h w]`.
         offset: Becomes the residual less gradient times flow, `[h w]`.
         visible: Becomes 1 where the pixel goes to a place in the image, else 0.
     """
     height, width = offset.shape
-    # Beyond these ends of the image, in its own precision, all that is sampled is its border.
+    # Ends of the image, and its outermost pixels, in its own precision.
     right, bottom = np.float32(width - 0.5), np.float32(height - 0.5)
+    last_u, last_v, zero = np.float32(width - 1), np.float32(height - 1), np.float32(0)
     for row in range(height):
         for c in range(width):
             u, v = flow[0, row, c] + np.float32(c), flow[1, row, c] + np.float32(row)
             inside = u >= -0.5 and u <= right and v >= -0.5 and v <= bottom
             visible[row, c] = np.float32(1 if inside else 0)
-            u, v = min(max(u, -3.0), right + 3.0), min(max(v, -3.0), bottom + 3.0)
+            u, v = min(max(u, zero), last_u), min(max(v, zero), last_v)
             left, top = floor(u), floor(v)  # type: ignore[arg-type]
             s, t = u - left, v - top
             x, y = int(left), int(top)
-            x0, x1 = min(max(x - 1, 0), width - 1), min(max(x, 0), width - 1)
-            x2, x3 = min(max(x + 1, 0), width - 1), min(max(x + 2, 0), width - 1)
-            a0, a1, a2, a3 = _far(s + 1.0), _near(s), _near(1.0 - s), _far(2.0 - s)
+            (a0, b0), (a1, b1) = _ends(1 - s), _middle(s)
+            (a2, b2), (a3, b3) = _middle(1 - s), _ends(s)
+            b0, b2 = -b0, -b2
             level, to_u, to_v = np.float32(0), np.float32(0), np.float32(0)
             for tap in range(4):
-                k = min(max(y - 1 + tap, 0), height - 1)
                 if tap == 0:
-                    share = _far(t + 1.0)
+                    share, rise = _ends(1 - t)
+                    rise = -rise
                 elif tap == 1:
-                    share = _near(t)
+                    share, rise = _middle(t)
                 elif tap == 2:
-                    share = _near(1.0 - t)
+                    share, rise = _middle(1 - t)
+                    rise = -rise
                 else:
-                    share = _far(2.0 - t)
-                a, b, d = second[0, k], second[1, k], second[2, k]
-                level += share * (a0 * a[x0] + a1 * a[x1] + a2 * a[x2] + a3 * a[x3])
-                to_u += share * (a0 * b[x0] + a1 * b[x1] + a2 * b[x2] + a3 * b[x3])
-                to_v += share * (a0 * d[x0] + a1 * d[x1] + a2 * d[x2] + a3 * d[x3])
+                    share, rise = _ends(t)
+                k, p = second[y + tap, x], second[y + tap, x + 1]
+                q, r = second[y + tap, x + 2], second[y + tap, x + 3]
+                along = a0 * k + a1 * p + a2 * q + a3 * r
+                level += share * along
+                to_v += rise * along
+                to_u += share * (b0 * k + b1 * p + b2 * q + b3 * r)
             to_u, to_v = 0.5 * (first[1, row, c] + to_u), 0.5 * (first[2, row, c] + to_v)
             if not to_u * to_u + to_v * to_v > least:
                 to_u, to_v = np.float32(0), np.float32(0)
