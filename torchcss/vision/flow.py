@@ -29,8 +29,8 @@ How it is minimised:
   solves it, preconditioned by the exact inverse of every pixel's 2 x 2 block.
 - *Medians*: after each warp a median over a small window removes isolated outliers, as Sun, Roth
   and Black (2010) advise. At the end of each level the `ACCURATE` preset replaces it, along jumps
-  of the flow, by their median weighted by distance, by similarity of brightness, and by how far
-  the data term holds; motion boundaries then follow the outlines of objects.
+  of the flow, by their median weighted by distance, by similarity of texture, and by how far the
+  data term holds; motion boundaries then follow the outlines of objects.
 
 By default: `robust_flow(first, second)`; `configuration=TRACKING` when every frame of a video needs
 it.
@@ -136,7 +136,7 @@ class FlowConfiguration:
     smoothness: FlowPotential = field(
         default_factory=lambda: Charbonnier(nu=0.045, sigma=0.042, power=0.4)
     )
-    texture: float = 0.75
+    texture: float = 0.72
     pyramid_factor: float = 0.7
     sigma_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
     num_warps: int = 9
@@ -169,6 +169,7 @@ ACCURATE = FlowConfiguration()
 TRACKING_FLOW = FlowConfiguration(
     data=Lorentzian(nu=1.0, sigma=0.0033),
     smoothness=Lorentzian(nu=0.06, sigma=0.042),
+    texture=0.75,
     pyramid_factor=0.5,
     sigma_factors=(100.0, 1.0),
     num_warps=4,
@@ -221,7 +222,7 @@ def robust_flow(
     state = frames.new_zeros(frames.shape[0], 3, 1, 1)
     levels = [_Level.of(grey, configuration.texture) for grey in _pyramid(frames, configuration)]
     for level in levels:
-        rows, columns = level.grey.shape[-2:]
+        rows, columns = level.first.shape[-2:]
         scale = state.new_tensor([columns / state.shape[-1], rows / state.shape[-2], 1.0])
         state = _resized(state, (rows, columns)) * scale.view(1, 3, 1, 1)
         state = torch.cat(_refine(state[:, :2], state[:, 2:], level, configuration), dim=1)
@@ -328,22 +329,20 @@ class _Level(NamedTuple):
     """A level of the pyramid.
 
     Attributes:
-        grey: Grey levels of the first frame.
-        first: What is left of them without structure, and its slopes.
+        first: What is left of the first frame without structure, and its slopes.
         second: Spline through what is left of the second frame.
     """
 
-    grey: Plane
     first: Float[Tensor, "b 3 h w"]
     second: Coefficients
 
     @staticmethod
     def of(frames: Field, texture: float) -> _Level:
         """The level of both frames, with so large a share of their structure taken out."""
-        left = frames - texture * _structure_of_wider(frames)
-        spline = image_spline(left)
-        first = torch.cat([left[:, :1], image_slopes(spline[:, :1])], dim=1)
-        return _Level(frames[:, :1], first, spline[:, 1:])
+        frames = frames - texture * _structure_of_wider(frames)
+        spline = image_spline(frames)
+        first = torch.cat([frames[:, :1], image_slopes(spline[:, :1])], dim=1)
+        return _Level(first, spline[:, 1:])
 
     def held(self, flow: Field, brighter: Plane, potential: FlowPotential) -> Plane:
         """How far constant brightness holds under a flow: 0 where the pixel leaves the view."""
@@ -391,8 +390,8 @@ def _refine(
         flow = _median(flow, _MEDIAN_RADIUS)
         if configuration.weighted_median_radius and warp + 1 == configuration.num_warps:
             held = level.held(unfiltered, brighter, configuration.data)
-            radius = configuration.weighted_median_radius
-            flow = _with_weighted_median_along_jumps(flow, unfiltered, held, level.grey, radius)
+            guide, radius = level.first[:, :1], configuration.weighted_median_radius
+            flow = _with_weighted_median_along_jumps(flow, unfiltered, held, guide, radius)
     return flow, brighter
 
 
