@@ -39,8 +39,9 @@ def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFi
     # Smooth terms: what is left of their steepest steps is nothing.
     for name in ("flow", "stabiliser"):
         assert table[name, "far"]["discontinuity"] < 1e-3
-    # The mode is a minimum of the sum, and the slices are no noise.
-    assert 1 <= table["sum", "close"]["num_minima"] < 5
+    # The mode is a minimum of the sum, and the slices are no noise, which would have a minimum at
+    # every third of the 51 samples; with seeds 0 to 4 they have 3.8 to 7.4.
+    assert 1 <= table["sum", "close"]["num_minima"] < 51 / 5
     first, *lines = report["table"]["rows"]
     assert first[:2] == ["arm, frame 3, mean of all lines", table["sum", "close"]["num_minima_raw"]]
     assert [row[0] for row in lines] == [f"arm, frame 3, eigen {k}" for k in (0, 1)]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from torchcss.kernels.checked import run
 from torchcss.vision import sampling
@@ -68,12 +69,14 @@ def image_spline(images: Images) -> Coefficients:
 
 def _spline_along_u(values: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n+3"]:
     num = values.shape[-1]
-    matrix = torch.eye(num, dtype=values.dtype, device=values.device)
     if num > 1:
-        inner, pixel = matrix[1:-1], torch.arange(num - 2, device=values.device)
-        inner[pixel, pixel] = inner[pixel, pixel + 2] = 1 / 6
-        inner[pixel, pixel + 1] = 4 / 6
-        values = torch.linalg.solve(matrix.mT, values, left=False)
+        # The pixels at the ends are coefficients themselves.
+        inner = values.new_full((num - 2,), 1 / 6)
+        own = functional.pad(4 * inner, (1, 1), value=1.0)
+        left, right = functional.pad(inner, (0, 1)), functional.pad(inner, (1, 0))
+        matrix = own.diag() + left.diag(-1) + right.diag(1)
+        # `solve` would make an accelerator wait to see whether the matrix is singular.
+        values = torch.linalg.solve_ex(matrix.mT, values, left=False).result
         before, behind = (
             2 * edge - next_to_it
             for edge, next_to_it in (
