@@ -18,7 +18,7 @@ STEPPED = {"arm": 500, "person": 660}
 """Waits of the host in the step of a frame, in the mean over seeds, which differ by a third: 22 to
 42 evaluations of a few samples each. An arm has 490 in the mean over twelve seeds."""
 
-EVALUATED = {"arm": 18, "person": 20}
+EVALUATED = {"arm": 17, "person": 20}
 """The same for every evaluation of the cost, which hardly differs."""
 
 _SEEDS = range(4)

@@ -3,23 +3,24 @@
 Section 3.1.2 [IJRR] takes its flow and its motion boundaries from the method of Black and Anandan
 (1996). With a flow f = (u, v) in pixels, first frame A, second frame B, the energy is
 
-    E(f) = sum_x rho_D( (B(x + f) - A(x))^2 )  +  sum_{x ~ y} rho_S( |f(x) - f(y)|^2 )
+    E(f) = sum_x rho_D( (B(x + f) - A(x) - c(x))^2 )  +  sum_{x ~ y} rho_S( |f(x) - f(y)|^2 )
 
-over pixels x and pairs of neighbours x ~ y: constant brightness and first-order smoothness, each
-under a robust potential of `torchcss.robust`, so that an occluded pixel or a motion boundary costs
-little more than a moderate misfit. At the minimum, the weight rho'(s) / rho'(0) of a residual says
-how far the model holds there; one minus it is the **outlier map** of that term, in [0, 1]. The maps
-widen sigma to a residual that matters to a user of the flow (the *outlier scale*): the sigma that
-gives the best flow already doubts the noise of a camera.
+over pixels x and pairs of neighbours x ~ y: brightness that is constant but for a smooth change c
+(Negahdaripour 1998; ours), and first-order smoothness, each under a robust potential of
+`torchcss.robust`, so that an occluded pixel or a motion boundary costs little more than a moderate
+misfit. At the minimum, the weight rho'(s) / rho'(0) of a residual says how far the model holds
+there; one minus it is the **outlier map** of that term, in [0, 1]. The maps widen sigma to a
+residual that matters to a user of the flow (the *outlier scale*): the sigma that gives the best
+flow already doubts the noise of a camera.
 
 How it is minimised:
 
 - *Coarse to fine*: a pyramid of both frames; every level starts from the flow of the level above.
 - *Noise*: both frames are blurred as far as their noise asks for.
 - *Texture*: each level loses much of its smooth structure (Rudin, Osher and Fatemi 1992), which
-  takes shadows and changes of light along. What is left of these is a smooth picture c of how much
-  brighter the scene has become: it is taken from the residual, and found anew with every
-  second warp (Negahdaripour 1998).
+  takes shadows along.
+- *Changes of light*: with every second warp c is found anew, as a weighted mean of the residual
+  about each pixel.
 - *Warping*: B is sampled at x + f and made linear in f; pixels that leave the view have no data
   term. Between pixels an image is the natural cubic spline through them: on smooth images its flow
   is biased by less than 0.01 px, with cubic convolution by 0.04 (measured).
@@ -32,8 +33,8 @@ How it is minimised:
   of the flow, by their median weighted by distance, by similarity of texture, and by how far the
   data term holds; motion boundaries then follow the outlines of objects.
 
-By default: `robust_flow(first, second)`; `configuration=TRACKING` when every frame of a video needs
-it.
+By default: `robust_flow(first, second)`; `configuration=TRACKING_FLOW` when every frame of a video
+needs it.
 """
 
 from __future__ import annotations
