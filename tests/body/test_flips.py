@@ -103,3 +103,20 @@ def test_limbs_own_the_parameters_that_move_nothing_else():
         "r_hip_flexion", "r_hip_abduction", "r_hip_twist", "r_knee_flexion", "r_ankle_flexion"
     ]  # fmt: skip
     assert limbs["l_arm"].groups == ("l_elbow", "l_wrist", "l_hand_tip")
+
+
+@pytest.mark.parametrize("name", ["body34", "arm8"])
+def test_joints_move_to_the_lines_of_sight_that_are_given(name: str, generator: torch.Generator):
+    body = load_body(name)
+    segments = Segments(body)
+    joints, others = random_joints(body, 2, generator)
+    flipped = torch.rand(len(segments.groups), generator=generator) < 0.5
+
+    def sight(places: torch.Tensor) -> torch.Tensor:
+        return (places - CENTRE) / (places - CENTRE).norm(dim=-1, keepdim=True)
+
+    own = segments.flip(joints, flipped, CENTRE, sight(joints))
+    torch.testing.assert_close(own, segments.flip(joints, flipped, CENTRE))
+    found = segments.flip(joints, flipped, CENTRE, sight(others))
+    moved = [child for child, _, _ in segments._rows]
+    torch.testing.assert_close(sight(found)[moved], sight(others)[segments.joint][moved])

@@ -70,6 +70,8 @@ class Segments:
         groups: Names of the groups that flip as one, as both halves of hips and of shoulders do.
         trunk: Those of the trunk without the head.
         limbs: Arms and legs.
+        depth: How many segments of a limb flip, from the trunk outwards. The hand of a body moves
+            with its forearm; that of an arm has joints of its own.
     """
 
     def __init__(self, body: BodyModel) -> None:
@@ -106,12 +108,14 @@ class Segments:
         )
         # The limb of a body from a file may have no joint that turns.
         self.limbs = tuple(limb for limb in found if limb.columns.numel())
+        self.depth = 2 if len(self.limbs) > 1 else 3
 
     def flip(
         self,
         joints_world: Float[Tensor, "*batch j 3"],
         flipped: Bool[Tensor, "*batch g"],
         centre_world: Float[Tensor, "3"],
+        sight_world: Float[Tensor, "*batch j 3"] | None = None,
     ) -> Float[Tensor, "*batch m 3"]:
         """Move joints along their lines of sight so that some segments lean the other way.
 
@@ -124,6 +128,8 @@ class Segments:
             joints_world: Joint centres of a posed body, metres.
             flipped: Which groups flip, in the order of `groups`.
             centre_world: The camera's centre.
+            sight_world: Unit vectors along the lines of sight on which the joints shall be; None:
+                those on which they are.
 
         Returns:
             Positions of the joints `joint`, metres.
@@ -137,6 +143,8 @@ class Segments:
             squared = (old[child] - old[parent]).square().sum(-1, keepdim=True)
             lean = torch.sign(depth - (along * old[parent]).sum(-1, keepdim=True))
             lean = torch.where(flipped[..., group, None], -lean, lean)
+            if sight_world is not None:
+                along = sight_world[..., self.joint[child], :]
             foot = (along * after[parent]).sum(-1, keepdim=True)
             reach = squared - after[parent].square().sum(-1, keepdim=True) + foot.square()
             after[child] = (foot + lean * reach.clamp(min=0).sqrt()) * along

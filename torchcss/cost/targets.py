@@ -85,7 +85,7 @@ class PointTargets:
         body, weight = self.body, self.sigma.pow(-2)
         pose, points = self._pose(x)
         error = points - self.target
-        stiffness = weight[:, None, None] * torch.eye(3).to(error)
+        stiffness = weight[:, None, None] * torch.eye(3, dtype=error.dtype, device=error.device)
         cost = PointCost(
             0.5 * weight * error.square().sum(-1),
             weight[:, None] * error,

@@ -28,7 +28,7 @@ from collections.abc import Mapping
 from dataclasses import field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss.body.catalog import PLACES, PROPORTIONS, Proportions, without_side
@@ -293,35 +293,56 @@ def flips(
         steps: How long each is looked for.
     """
     body, device = cost.body, x.device
-    # The hand of a body moves with its forearm; that of an arm has joints of its own.
-    depth = 2 if len(segments.limbs) > 1 else 3
-    ways = [_all_ways(len(segments.trunk), device), _all_ways(depth, device)]
+    ways = [all_ways(len(segments.trunk), device), all_ways(segments.depth, device)]
     flipped = torch.zeros(
         len(ways[0]), len(ways[1]), len(segments.groups), dtype=torch.bool, device=device
     )
     for bit, group in enumerate(segments.trunk):
         flipped[:, :, segments.groups.index(group)] = ways[0][:, None, bit]
     for limb in segments.limbs:
-        for bit, group in enumerate(limb.groups[:depth]):
+        for bit, group in enumerate(limb.groups[: segments.depth]):
             flipped[:, :, segments.groups.index(group)] = ways[1][None, :, bit]
     shape = (len(x), *flipped.shape[:2])
     joints = body.pose(x).joints[:, None, None].expand(*shape, -1, 3)
     target = segments.flip(joints, flipped.expand(*shape, -1), cost.camera.centre_world)
-    reach = PointTargets(
-        body=body,
-        link=body.marker_link[segments.joint],
-        offset=body.marker_offset[segments.joint],
-        target=target.flatten(0, 2),
-        sigma=target.new_full(target.shape[-2:-1], _ON_PLACE),
-    )
     start = x[:, None, None].expand(*shape, -1).flatten(0, 2)
-    solved = TrustRegionNewton(max_steps=steps, tolerance=0.1).ends(reach, start, bounds)
+    solved = place_joints(body, segments, target.flatten(0, 2), start, bounds, steps=steps)
     return _best_combinations(
         widened(cost, 1.5 * _MIDDLE), segments, solved.unflatten(0, (-1, len(ways[1]))), num
     )
 
 
-def _all_ways(bits: int, device: torch.device) -> Tensor:
+def place_joints(
+    body: BodyModel,
+    segments: Segments,
+    target: Float[Tensor, "s m 3"],
+    start: Float[Tensor, "s n"],
+    bounds: Bounds,
+    *,
+    steps: int,
+) -> Float[Tensor, "s n"]:
+    """The states that put the joints of the segments at given places, as far as bounds allow.
+
+    Args:
+        body: The body.
+        segments: Its segments.
+        target: Where their joints shall be, metres.
+        start: Where to start from.
+        bounds: Box limits.
+        steps: How long each is looked for.
+    """
+    reach = PointTargets(
+        body=body,
+        link=body.marker_link[segments.joint],
+        offset=body.marker_offset[segments.joint],
+        target=target,
+        sigma=target.new_full(target.shape[1:2], _ON_PLACE),
+    )
+    return TrustRegionNewton(max_steps=steps, tolerance=0.1).ends(reach, start, bounds)
+
+
+def all_ways(bits: int, device: torch.device) -> Bool[Tensor, "w b"]:
+    """Every combination of so many truths, none of them first."""
     rows = list(itertools.product((False, True), repeat=bits))
     return torch.tensor(rows, dtype=torch.bool, device=device).reshape(len(rows), bits)
 

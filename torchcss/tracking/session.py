@@ -37,11 +37,12 @@ from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
 from torchcss.body.rotations import within_half_turn
 from torchcss.cost.fused import threads_for
+from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError
 from torchcss.inference.loss_monitor import MonitorState
 from torchcss.inference.mixture import GaussianMixture, tempered
-from torchcss.inference.proposals import CovarianceScaled, with_moves
+from torchcss.inference.proposals import CovarianceScaled, Proposal, with_moves
 from torchcss.inference.tracker import (
     SequenceTracker,
     Tracker,
@@ -53,6 +54,7 @@ from torchcss.initialise.result import Initialisation
 from torchcss.initialise.view import CameraView
 from torchcss.stopwatch import Stopwatch
 from torchcss.tracking.flip_moves import Flips
+from torchcss.tracking.keypoint_moves import MissedKeypoints
 from torchcss.tracking.limb_moves import LostLimbs
 from torchcss.tracking.settings import Plan, Settings, make_plan
 from torchcss.tracking.surface_prediction import PicturePair, SurfaceDynamics, SurfaceMotion
@@ -509,6 +511,8 @@ class TrackingSession:
             if recovery is not None and lost:
                 flips = replace(flips, num=recovery.num_flips, log_odds=0.0)
             moves.append((flips, num if lost else _NUM_FLIPS))
+        if (missed := self._missed_keypoints(cost, search)) is not None:
+            moves.append((missed, _NUM_FLIPS))
         if plan.limb_jumps:
             limbs = LostLimbs(search=search, body=state.body, cost=cost, num=plan.limb_jumps)
             moves.append((limbs, 2 * plan.limb_jumps))
@@ -527,16 +531,38 @@ class TrackingSession:
             )
         return replace(tracker, proposal=with_moves(search, moves, num), dynamics=dynamics)
 
+    def _missed_keypoints(self, cost: TrackingCost, search: Proposal) -> MissedKeypoints | None:
+        """The move to keypoints that the best mode misses; the first pose was fitted to them."""
+        if not self._flips_at_all or int(self.state.tracker.frame) == 0:
+            return None
+        keypoints = cost.views[0].keypoints
+        term = next((term for term in cost.choice.terms if isinstance(term, JointTerm)), None)
+        if keypoints is None or term is None:
+            return None
+        return MissedKeypoints(
+            search=search,
+            body=self.state.body,
+            camera=cost.camera,
+            keypoints=keypoints,
+            term=term,
+            num=_NUM_FLIPS,
+        )
+
+    @property
+    def _flips_at_all(self) -> bool:
+        """Whether poses that look alike are searched; to several cameras they look unlike."""
+        return bool(self.plan.jumps_every) and len(self._observers) == 1
+
     def _flips_now(self) -> bool:
-        """Whether the flips of the best mode are searched; to several cameras they look unlike."""
-        every, frame = self.plan.jumps_every, int(self.state.tracker.frame)
-        return bool(every) and frame % every == 0 and len(self._observers) == 1
+        """Whether the flips of the best mode are searched."""
+        return self._flips_at_all and int(self.state.tracker.frame) % self.plan.jumps_every == 0
 
     def _terms_of_best(self, cost: TrackingCost, modes: GaussianMixture) -> dict[str, float]:
         """What the best mode costs by term, about the prior that the search had."""
         best = modes.mean[:1]
         values = cost.terms(best) | cost.weight_only_terms(best)
-        return {name: float(value[0]) for name, value in values.items()}
+        every = torch.cat([best.new_zeros(0), *values.values()]).tolist()
+        return dict(zip(values, every, strict=True))
 
 
 _AS_FITTED = CovarianceScaled(covariance_scale=1.0)
