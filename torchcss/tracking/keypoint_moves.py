@@ -39,8 +39,7 @@ class MissedKeypoints(Move):
 
     Attributes:
         search: How samples of each pose are drawn.
-        log_odds: Weight of a pose against that of the best mode, nats. None: the best mode does not
-            explain the keypoint either.
+        log_odds: Weight of a pose against that of the best mode, nats: keypoints may be wrong.
         body: The body on this frame's base.
         camera: The camera of the view.
         keypoints: Those of the frame.
@@ -48,7 +47,6 @@ class MissedKeypoints(Move):
         num: Most poses wanted.
     """
 
-    log_odds: float = 0.0
     body: BodyModel
     camera: Camera
     keypoints: Keypoints
