@@ -1137,6 +1137,19 @@ def test_metashape_counts_from_the_middle(tmp_path: Path) -> None:
         load_camera(path)
 
 
+@pytest.mark.parametrize("name", ["a.xml", "transforms.json"])
+def test_a_radius_to_the_eighth_power(tmp_path: Path, name: str) -> None:
+    """k4 of Metashape and Nerfstudio is not OpenCV's, which divides by it."""
+    values = {"f": FY, "fl_x": FX, "fl_y": FY, "cx": 1, "cy": 2, "width": 640, "height": 480,
+              "w": 640, "h": 480, "k1": 0.1, "k2": 0.0, "k3": 0.0, "k4": 0.3}  # fmt: skip
+    inner = "".join(f"<{word}>{value}</{word}>" for word, value in values.items())
+    xml = f"<calibration>{inner}</calibration>"
+    (tmp_path / name).write_text(xml if name == "a.xml" else json.dumps(values))
+    for load in (load_camera, load_lens):
+        with pytest.raises(CameraError, match=f"{name}: .*k4 without k5 and k6"):
+            load(tmp_path / name)
+
+
 def test_what_a_camera_file_leaves_open_is_told(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text(table("cam_0", [0.0, 0.0, 2.0], "rotation_count = 2"))

@@ -370,6 +370,12 @@ def _lens(values: Mapping[str, Any], fisheye: bool | str | Mirror = False) -> An
         if fisheye == "equidistant" and not any(values.get(each) for each in ("p1", "p2")):
             first = 1 if "k1" in values or "mu" not in values else 2  # camodocal's first is k2
             return [values.get(f"k{first + n}", 0.0) for n in range(4)]
+        if values.get("k4") and not fisheye and not {"k5", "k6"} & values.keys():
+            raise CameraError(
+                "k4 without k5 and k6 is that of the radius to the eighth power (Metashape, "
+                "Nerfstudio), which no lens of OpenCV has: calibrate again without it, or track "
+                "pictures that the program has undistorted"
+            )
         return [values.get(each, 0.0) for each in _COEFFICIENTS]
     radial, tangential = (first_of(values, _WORDS[word]) for word in ("radial", "tangential"))
     if len(shape := _shape(radial)) != 1 or not 0 < shape[0] <= 6 or radial is None:
@@ -922,10 +928,8 @@ def _from_the_middle(found: Mapping[str, Any]) -> dict[str, Any]:
     f, cx, cy, b1, b2, k1, k2, k3, k4, p2, p1, width, height = (found.get(w) or 0 for w in words)
     with refusing(CameraError, "not Metashape's calibration"):
         K = [[f + b1, b2, cx + 0.5 * (width - 1)], [0, f, cy + 0.5 * (height - 1)], [0, 0, 1]]
-    is_fisheye = _FISHEYE.search(str(found.get("projection"))) and not (p1 or p2)
-    lens = [k1, k2, k3, k4] if is_fisheye else [k1, k2, p1, p2, k3, k4]
-    return {"K": K, "dist": lens, "image_size_wh": [width, height],
-            "projection": found.get("projection")}  # fmt: skip
+    return {"K": K, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3, "k4": k4,
+            "image_size_wh": [width, height], "projection": found.get("projection")}  # fmt: skip
 
 
 def _read_qualisys(path: Path) -> dict[str, Entry]:

@@ -1955,3 +1955,29 @@ def test_the_path_of_a_picture(tmp_path: Path) -> None:
               for t in SEEN]  # fmt: skip
     path = write(tmp_path / "a.json", frames)
     check(read(path, frame_names=[f"img_{100 + t}.jpg" for t in T]), (3,))
+
+
+@pytest.mark.parametrize("lost", [(3,), (3, 15), (2, 3, 4, 13)])
+def test_joints_above_a_threshold_by_their_numbers(tmp_path: Path, lost: tuple[int, ...]) -> None:
+    """Transformers' ViTPose says in `labels` which joints are left: 16 of them are not MPII's."""
+    frames = []
+    for t in T:
+        left = [n for n in range(len(COCO)) if n not in lost and (n != 1 or t % 2)]
+        x_y_c = person(t)[left]
+        frames.append([{"keypoints": x_y_c[:, :2].tolist(), "scores": x_y_c[:, 2].tolist(),
+                        "labels": left, "bbox": [0, 0, 9, 9]}])  # fmt: skip
+    found = read(write(tmp_path / "a.json", frames))
+    names = [name for n, name in enumerate(COCO) if n not in lost]
+    check(found, names=tuple(name for name in names if name in LIMBS))
+    for n in lost:
+        assert not found.confidence[:, found.names.index(str(COCO[n]))].any()
+
+
+def test_joints_of_networks_of_bodies(tmp_path: Path) -> None:
+    """SAM 3D Body's and PHALP's places in the picture, beside those in space."""
+    names = ALIASES["MHR-70"]
+    frames = [[{"pred_keypoints_3d": [[0.1, 0.2, 0.3]] * 70, "bbox": [0, 0, 9, 9],
+                "pred_keypoints_2d": person(t, names)[:, :2].tolist()}] for t in T]  # fmt: skip
+    check(read(write(tmp_path / "a.json", frames)))
+    np.savez(tmp_path / "a.npz", kp2d=np.stack([person(t) for t in T]), box=np.ones((FRAMES, 4)))
+    check(read(tmp_path / "a.npz"))

@@ -43,7 +43,8 @@ from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
 _PLACES = names_in(
-    "keypoints keypoints2d joints2d kps kpts poses positions pose joints xy keypoint keypoint2d"
+    "keypoints keypoints2d joints2d kps kpts poses positions pose joints xy keypoint keypoint2d "
+    "predkeypoints2d kp2d"
 )
 _FREEMOCAP = (553, 3)
 """x, y and z of FreeMoCap's points, which are MediaPipe's of body, hands and face."""

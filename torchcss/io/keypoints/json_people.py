@@ -38,7 +38,7 @@ from torchcss.io.keypoints.words import (
     first_of,
     plain_word,
 )
-from torchcss.joint_names import names_in
+from torchcss.joint_names import ALIASES, names_in
 
 PEOPLE = names_in(
     "people bodies instances instanceinfo predictions annots poses persons players detections body"
@@ -48,7 +48,7 @@ _OBJECTS = names_in("bodylist objects skeletons skeleton")
 
 JOINTS = names_in(
     "posekeypoints2d posekeypoints predkeypoints keypoints poselandmarks landmarks landmark joints "
-    "pose kps kpts keypointsxy keypoints2d keypoint2d joints2d"
+    "pose kps kpts keypointsxy keypoints2d keypoint2d joints2d predkeypoints2d kp2d"
 )
 _AXES = tuple(
     names_in(f"pixel{axis} color{axis} image{axis} {axis}2d {axis}px {axis}") for axis in "xy"
@@ -57,6 +57,8 @@ _AXES = tuple(
 
 _BOX = frozenset(names_in("x left x1 xmin"))
 """What has a word of these has the size of a box."""
+
+_OF_COCO = len(ALIASES["COCO-17"])
 
 _HEADS = names_in("meta_info metadata meta info header video video_info image")
 
@@ -209,6 +211,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
         joints = _joints(where, rows[:, :2], rows[:, 2], scores)
         if names is None:
             names = _said_by_rows(value)
+            joints = joints if names else _by_labels(joints, listed(around.get("labels")))
     return [Person(joints, track_of(around), None if names is None else tuple(map(str, names)))]
 
 
@@ -224,6 +227,16 @@ def _said_by_rows(rows: list[Any]) -> list[str] | None:
         if len(found) == len(rows) and (kind is str or _are_numbers(found)):
             return found
     return None
+
+
+def _by_labels(joints: np.ndarray, labels: list[Any]) -> np.ndarray:
+    """All joints of one of whom Transformers keeps those above a threshold, by their numbers."""
+    whole = all(type(each) is int and 0 <= each < _OF_COCO for each in labels)
+    if not whole or len(labels) != len(joints) or len({*labels}) < len(labels):
+        return joints
+    found = np.zeros((_OF_COCO, 3))
+    found[labels] = joints
+    return found
 
 
 def _are_numbers(found: list[str]) -> bool:
