@@ -16,6 +16,7 @@ import torch
 from torchcss.errors import KeypointError
 from torchcss.io.keypoints.annotated import VIA_SHAPE
 from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.mediapipe import MEDIAPIPE_NAMES
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import Scale, read_keypoints, read_person
 from torchcss.joint_names import ALIASES
@@ -1276,7 +1277,8 @@ def test_y_that_counts_upwards_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [("a.mp4", "torchcss detect"), ("a.png", "init PICTURE --click"), ("a.trc", "in space"),
-     ("a.xlsx", "save it as CSV"), ("a.json.gz", "unpack"), ("a.yaml", "of another format")],
+     ("a.xlsx", "save it as CSV"), ("a.json.gz", "unpack"), ("a.yaml", "of another format"),
+     ("a.nc", "to_dlc_file"), ("a.nwb", "Neurodata")],
 )  # fmt: skip
 def test_files_of_other_kinds(tmp_path: Path, name: str, words: str) -> None:
     with pytest.raises(KeypointError, match=words):
@@ -1405,6 +1407,7 @@ def test_arrays_of_several_cameras_are_told(tmp_path: Path) -> None:
         ([{"version": 0, "tags": [], "shapes": [], "tracks": []}], "CVAT's backup of a task"),
         ({"version": "2.0", "item": {}, "annotations": []}, "V7 Darwin's"),
         ({"bone_list": [], "frames": []}, "in space"),
+        ([{"bodyparts": [], "bboxes": [], "bbox_scores": []}], "give the .h5 beside it"),
     ],
 )
 def test_formats_that_are_not_read_are_named(tmp_path: Path, content: Any, words: str) -> None:
@@ -1981,3 +1984,23 @@ def test_joints_of_networks_of_bodies(tmp_path: Path) -> None:
     check(read(write(tmp_path / "a.json", frames)))
     np.savez(tmp_path / "a.npz", kp2d=np.stack([person(t) for t in T]), box=np.ones((FRAMES, 4)))
     check(read(tmp_path / "a.npz"))
+
+
+@pytest.mark.parametrize("others", ["left_hand_", "face_landmark_", "right_hand"])
+def test_a_body_by_number_beside_hands(tmp_path: Path, others: str) -> None:
+    """Holistic tables of MediaPipe name hands and face; the numbers are the body's joints."""
+    names = [*(f"pose_{n}" for n in range(33)), *(f"{others}{n}" for n in range(21))]
+    heads = ["frame", *(f"{name}{part}" for name in names for part in ("_x", "_y", "_visibility"))]
+    hand = np.tile([5.0, 6.0, 0.9], (21, 1))
+    rows = [[t, *np.vstack([person(t, ALIASES["MediaPipe-33"]), hand]).flat] for t in T]
+    found = read(write(tmp_path / "a.csv", wide(heads, rows)))
+    check(found)
+    assert any(f"left out: '{others}0_x" in line for line in found.report)
+
+
+def test_names_of_pythons_enumeration(tmp_path: Path) -> None:
+    frames = [{"frame": t, "landmarks": {f"PoseLandmark.{name.upper()}": {
+        "x": (u + 0.5) / SIZE[0], "y": (v + 0.5) / SIZE[1], "z": -0.1, "visibility": c}
+        for name, (u, v, c) in zip(MEDIAPIPE_NAMES, person(t, ALIASES["MediaPipe-33"]),
+                                   strict=True)}} for t in T]  # fmt: skip
+    check(read(write(tmp_path / "a.json", frames)))

@@ -80,6 +80,7 @@ _OTHERS = {
     "'COCO Keypoints 1.0'",
     "annotations item": "V7 Darwin's; export the dataset as COCO",
     "data_row projects": "Labelbox's; convert it to COCO",
+    "bodyparts bboxes": "DeepLabCut's before it makes a table of it; give the .h5 beside it",
     "bone_list frames": "Azure Kinect's joints in space; expected pixels",
 }
 """Files of other kinds by words in them, and what to do."""

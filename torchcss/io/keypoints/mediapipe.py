@@ -53,6 +53,7 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
         names: Names of their joints, or none; what comes in an order has none any more.
     """
     plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
+    plain = [name.removeprefix("poselandmark_") for name in plain]  # of Python's enumeration
     if plain and all(map(str.isdecimal, plain)):
         frames = _by_number(frames, [int(number) for number in plain])
         order = [*range(NUM_LANDMARKS)]

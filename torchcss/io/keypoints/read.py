@@ -88,6 +88,8 @@ _OTHERS = {
     ".trc .c3d .bvh .amc .mot .fbx .glb": "a motion in space; expected the pixels of joints",
     ".xlsx .xls .ods .numbers": f"a spreadsheet; {_AS_CSV}",
     ".parquet .feather .arrow .mat": f"a table that is not read; {_AS_CSV}",
+    ".nc": "movement's; movement.io.save_poses.to_dlc_file(dataset, 'keypoints.csv') writes CSV",
+    ".nwb": f"Neurodata Without Borders, which is not read; {_AS_CSV}",
     ".zip .gz .bz2 .xz .7z .tar .tgz .rar": "packed; unpack it",
 }
 """Files of other kinds by their suffixes, and what to do."""

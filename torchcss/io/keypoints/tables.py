@@ -38,7 +38,15 @@ from torchcss.io.keypoints.annotated import VIA_SHAPE, read_via_table
 from torchcss.io.keypoints.frames import check_one_video, in_seconds
 from torchcss.io.keypoints.json_people import JOINTS
 from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
-from torchcss.io.keypoints.people import Frames, Key, People, Person, joint_counts, screened
+from torchcss.io.keypoints.people import (
+    LAYOUT_SIZES,
+    Frames,
+    Key,
+    People,
+    Person,
+    joint_counts,
+    screened,
+)
 from torchcss.joint_names import CASE, names_in
 
 _PARTS = {
@@ -56,6 +64,9 @@ _PIXELS = re.compile("(?i)(^|_)(px|pixels?)(_|$)")
 _FRACTIONS = re.compile("(?i)(^|_)norm(ali[sz]ed)?(_|$)")
 _IN_SPACE = frozenset(names_in("obj world 3d"))
 _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)s?(_|(?=[0-9])))+"
+_OF_BODY_PARTS = re.compile("hand|face|finger")
+"""What points beside those of a numbered body are called."""
+
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
 _NUMBER = re.compile(r"([-+]?[0-9.,]+([eE][-+]?[0-9]+)?|nan)$")
@@ -358,8 +369,12 @@ def _headed(heading: Sequence[str]) -> _Columns:
     if numbers := [joint for joint in half if joint.isdecimal()]:
         raise KeypointError(f"row 1: joint {numbers[0]} has x or y, not both")
     columns = {joint: parts for joint, parts in columns.items() if {0, 1} <= set(parts)}
-    if any(joint.strip("0123456789") for _, joint in columns):  # numbers beside names are a box's
-        columns = {joint: parts for joint, parts in columns.items() if not joint[1].isdecimal()}
+    numbered = {joint: parts for joint, parts in columns.items() if joint[1].isdecimal()}
+    named = [joint for _, joint in columns if joint.strip("0123456789")]
+    if len(numbered) in LAYOUT_SIZES and all(map(_OF_BODY_PARTS.search, named)):
+        columns = numbered
+    elif named:  # numbers beside names are a box's
+        columns = {joint: parts for joint, parts in columns.items() if joint not in numbered}
     if joint is not None and set(columns) == {("", "")}:
         track = None if track == joint else track
         return _Columns({("", ""): columns["", ""]}, len(heading), frame, joint, track, time)
