@@ -873,7 +873,7 @@ def test_a_camera_of_another_model_beside_one_that_is_read(tmp_path: Path, model
 
 
 @pytest.mark.parametrize(
-    "model", ["omni", "ds", "eucm", "FOV", "THIN_PRISM_FISHEYE", "MEI", "Scaramuzza"]
+    "model", ["omni", "ds", "eucm", "FOV", "THIN_PRISM_FISHEYE", "MEI", "Scaramuzza", "division"]
 )
 def test_lenses_of_other_models(tmp_path: Path, model: str) -> None:
     content = {"K": K, "D": LENS[:4], "width": 640, "height": 480, "camera_model": model}

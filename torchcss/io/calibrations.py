@@ -140,7 +140,8 @@ _IS_FISHEYE = names_in("fisheye isfisheye usefisheye fisheyemodel")
 _IS_OTHER = names_in("mappingcoefficients xi")
 _FISHEYE = re.compile("equi|fish_?eye|kannala|^kb[48]?$", re.IGNORECASE)
 _OTHER = re.compile(
-    "omni|ucm|fov|theta|prism_fish|scaramuzza|ocam|mei$|double|^ds$|^ds-|-ds$", re.IGNORECASE
+    "omni|ucm|fov|theta|prism_fish|scaramuzza|ocam|mei$|double|^ds$|^ds-|-ds$|division",
+    re.IGNORECASE,
 )
 """Models of lenses that are OpenCV's fisheye lens, and others that see as much."""
 

@@ -366,6 +366,14 @@ def test_rate(tmp_path: Path, time: str, rate: float) -> None:
     assert read_motion_capture(path, frame_rate=30).frame_rate == 30
 
 
+@pytest.mark.parametrize("time", ["30", "33.3333"])
+def test_what_is_no_frame_time(tmp_path: Path, time: str) -> None:
+    path = write_bvh(tmp_path, BVH.replace(".0083333", time))
+    with pytest.raises(MotionCaptureError, match=f"frames last {time} seconds each.*frame_rate"):
+        read_motion_capture(path)
+    assert read_motion_capture(path, frame_rate=30).frame_rate == 30
+
+
 @pytest.mark.parametrize("rate", [0.0, -1.0, math.nan, math.inf])
 def test_rates_that_make_no_sense(tmp_path: Path, rate: float) -> None:
     with pytest.raises(ConfigurationError, match="rate"):

@@ -50,6 +50,9 @@ from torchcss.joint_names import LIMB_JOINTS, skeleton_joint_names
 ACCLAIM_RATE = 120.0
 """Frames per second of an AMC, which does not say: those of the CMU database."""
 
+_SLOWEST = 1.0
+"""Frames per second that somebody's motion has at least."""
+
 _Z_TO_Y: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Turns rows of places that are Z up to Y up."""
 
@@ -112,6 +115,11 @@ def read_motion_capture(
         )
     if frame_rate is not None:
         rate, report = frame_rate, [line for line in report if "rate assumed" not in line]
+    elif rate < _SLOWEST:
+        raise MotionCaptureError(
+            f"{path}: frames last {1 / rate:g} seconds each, which looks like frames per second or "
+            "milliseconds: give frame_rate"
+        )
     report = [f"{len(values)} frames, {rate:g} per second", *report]
     with np.errstate(all="ignore"):  # whatever overflows is found below
         rest, joints = rest_positions(segments), _positions(segments, values)
