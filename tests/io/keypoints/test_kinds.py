@@ -2004,3 +2004,23 @@ def test_names_of_pythons_enumeration(tmp_path: Path) -> None:
         for name, (u, v, c) in zip(MEDIAPIPE_NAMES, person(t, ALIASES["MediaPipe-33"]),
                                    strict=True)}} for t in T]  # fmt: skip
     check(read(write(tmp_path / "a.json", frames)))
+
+
+@pytest.mark.parametrize("form", ["in order", "numbered", "with names for frames"])
+def test_frames_that_stand_in_people(tmp_path: Path, form: str) -> None:
+    """Somebody's key is no frame: two people were frames 0 and 1, and their frames people."""
+    people: dict[str, Any] = {"person_1": [other(t).tolist() for t in T],
+                              "person_2": [person(t).tolist() for t in T]}  # fmt: skip
+    if form == "numbered":
+        people = {who: {str(t): own[t] for t in SEEN} for who, own in people.items()}
+    elif form == "with names for frames":
+        people = {
+            who: {"frames": [{"frame": t, "keypoints": own[t]} for t in SEEN]}
+            for who, own in people.items()
+        }
+    found = read(write(tmp_path / "a.json", people))
+    check(found, () if form == "in order" else (3,))
+    assert any("'person_2' of the file, by the file's tracks" in line for line in found.report)
+    write(tmp_path / "a.json", {"person_1": [flat(t) for t in T], "person_2": [flat(0)]})
+    with pytest.raises(KeypointError, match="person_1, person_2: expected as many frames"):
+        read(tmp_path / "a.json")

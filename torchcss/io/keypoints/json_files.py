@@ -90,6 +90,9 @@ _BY_LINES = (".jsonl", ".ndjson", ".txt")
 _HUGE = 1e19
 """No number of a frame is so large, nor a time, were it in nanoseconds since 1970."""
 
+_PERSON = re.compile("(person|human|subject|player|individual|track)[ _-]?(id)?[ _-]?[0-9]+", re.I)
+"""A key that is somebody, and no frame."""
+
 _TIME = re.compile(r"[0-9]+\.[0-9]+")
 """A key that is a time, and no number of a frame."""
 
@@ -252,6 +255,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
             return _frames(path, told[0], num_frames)
         if inner is not None or "shapes" in content:
             return [people_of(str(path), content)]
+        if content and all(map(_PERSON.fullmatch, content)):
+            return _of_people({who: _frames(path, own, num_frames) for who, own in content.items()})
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
             found = {key: people_of(f"{path}: {key}", value) for key, value in content.items()}
             if any(found.values()):
@@ -287,6 +292,23 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     if isinstance(first_of(content[0], (time or "",)), str):
         time = "seconds"
     return found if time is None else in_seconds(time, found)
+
+
+def _of_people(found: Mapping[str, list[list[Person]] | Frames]) -> list[list[Person]] | Frames:
+    """The people of every frame, of each person's frames."""
+    every: Frames = {}
+    for who, frames in found.items():
+        for key, people in enumerate(frames) if isinstance(frames, list) else frames.items():
+            own = [person._replace(track=person.track or who) for person in people]
+            every.setdefault(key, []).extend(own)
+    counts = {len(frames) if isinstance(frames, list) else 0 for frames in found.values()}
+    if counts == {0}:
+        return every
+    if len(counts) > 1:
+        raise KeypointError(
+            f"{', '.join(found)}: expected as many frames of everybody, or numbered ones"
+        )
+    return [*every.values()]
 
 
 _UNEVEN = 0.1
