@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
@@ -109,6 +111,21 @@ def test_what_is_not_missed_leads_nowhere(generator: torch.Generator):
     only[:] = 0.0
     only[body.joint_index("l_wrist")] = 1.0
     assert found(x, known._replace(confidence=only)) == nothing
+
+
+ROBOT = """<robot name="door"><link name="wall"/><link name="leaf"/>
+<joint name="hinge" type="revolute"><parent link="wall"/><child link="leaf"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+
+
+def test_a_body_without_limbs_is_left_alone(tmp_path: Path):
+    (tmp_path / "door.urdf").write_text(ROBOT)
+    place = torch.tensor([0.0, 0.0, -2.0]).double()
+    door = load_body(str(tmp_path / "door.urdf")).with_base(torch.eye(3).double(), place)
+    far = keypoints_of(door, door.rest)
+    far = far._replace(positions=far.positions + 200.0)
+    poses = poses_at_keypoints(door, CAMERA, door.rest, far, JointTerm(), num=8)
+    assert poses.shape == (0, door.num_parameters)
 
 
 def test_the_poses_are_components_of_the_odds_stated(generator: torch.Generator):

@@ -82,7 +82,8 @@ def poses_at_keypoints(
 
     Returns:
         The poses, each with fewer keypoints missed, and with a joint `POSES_APART` from where it is
-        in the others; none if the pose misses none, or is out of the camera's sight.
+        in the others; none if the pose misses none, or is out of the camera's sight, nor for a body
+        without limbs that can flip.
     """
     joints, targets = body.pose(x).joints, match_joints(keypoints, body.joint_names)
 
@@ -97,6 +98,8 @@ def poses_at_keypoints(
     if num < 1 or not bool(missed.any()):
         return x.new_zeros(0, len(x))
     segments, which = Segments(body), targets.joint[missed]
+    if not segments.limbs:
+        return x.new_zeros(0, len(x))
     sight = joints - camera.centre_world.to(joints)
     sight = sight / sight.norm(dim=-1, keepdim=True)
     sight = sight.index_copy(0, which, camera.rays(targets.position[missed]))

@@ -102,7 +102,8 @@ class Preset:
             likelihood. An arm keeps n: nothing tells it from its mirror image but
             where it was.
         jumps_every: Every how many frames the flips of the best mode join the search, see
-            `torchcss.tracking.flip_moves`; 0, as in the papers: never.
+            `torchcss.tracking.flip_moves`; 0, as in the papers: never, nor do limbs that are put
+            at keypoints that they miss (`torchcss.tracking.keypoint_moves`).
         keep_alike: See `Tracker`.
         coarse_every: See `Tracker`.
         optimiser: How samples descend.

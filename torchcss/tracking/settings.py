@@ -511,7 +511,8 @@ class Plan(NamedTuple):
         keypoints_first_only: Whether keypoints count in the first frame alone.
         boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
         recovery: How losses are told and what is done then; None: nothing.
-        jumps_every: Every how many frames the flips of the best mode join the search; 0: never.
+        jumps_every: Every how many frames the flips of the best mode join the search; 0: never, and
+            no limb is put at keypoints that it misses.
         limb_jumps: How many other poses of an arm join the search; 0: none.
         surface_prediction: Whether the pictures tell where each mode's trunk is expected.
         frame_interval: Seconds between frames.
