@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from made_sessions import moving_arm, session_on
 from torch import Tensor
 
 from torchcss.body.load import load_body
@@ -13,6 +14,7 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.joints import JointTerm
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled
+from torchcss.stopwatch import Stopwatch
 from torchcss.tracking.keypoint_moves import MissedKeypoints, poses_at_keypoints
 from torchcss.types import Keypoints
 from torchcss.vision.camera import Camera
@@ -126,6 +128,29 @@ def test_a_body_without_limbs_is_left_alone(tmp_path: Path):
     far = far._replace(positions=far.positions + 200.0)
     poses = poses_at_keypoints(door, CAMERA, door.rest, far, JointTerm(), num=8)
     assert poses.shape == (0, door.num_parameters)
+
+
+@pytest.mark.parametrize(
+    ("settings", "moves"),
+    [
+        ({}, True),
+        ({"keypoints_use": "first"}, False),
+        ({"preset": "ijrr_css", "keypoints_use": "all"}, False),
+    ],
+)
+def test_ours_looks_there_where_keypoints_are_tracked(settings: dict[str, str], moves: bool):
+    sequence = moving_arm(3)
+    session = session_on(sequence, "cpu", **settings)
+    steps = []
+    for frame in sequence.frames:
+        observation = session.observe(frame)
+        cost = session._cost(observation, session.state.memory, Stopwatch(), 1.0)
+        move = session._missed_keypoints(cost, CovarianceScaled(covariance_scale=8.0))
+        steps.append(move is not None)
+        if move is not None:
+            assert move.camera is cost.camera, "in the pixels of its keypoints"
+        session.step(observation)
+    assert steps == [False, moves, moves], "the first pose was fitted to the keypoints"
 
 
 def test_the_poses_are_components_of_the_odds_stated(generator: torch.Generator):
