@@ -30,7 +30,7 @@ MISSED = 2.0
 pull is less than four fifths of that, and falls."""
 
 _STEPS = 12
-"""Steps towards a pose: nearly all are within 5 cm then, and are descended from afterwards."""
+"""Steps towards a pose: all of 140 are within 5 cm of where more lead then; after eight, 95 %."""
 
 
 @frozen

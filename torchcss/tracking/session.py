@@ -73,7 +73,8 @@ _PITCH_LIMIT = math.radians(55)
 """The base follows once the root's pitch exceeds this, well before it locks at 90 degrees."""
 
 _NUM_FLIPS = 8
-"""Flips of the best mode that join the search where flips are made."""
+"""Flips of the best mode that join the search where flips are made; and so many poses at keypoints
+that it misses."""
 
 Image = Frame | np.ndarray
 """An image with its place in the video, or its pixels `[h w 3]` alone: it then is the next one."""
