@@ -134,6 +134,8 @@ ALIASES: Final[dict[str, tuple[str | None, ...]]] = {
         *_OPENPOSE_LEGS,
         *_columns("HumanoidRoot - -"),
     ),
+    # The second is the neck above the collar bones; the ears are never marked.
+    "PoseTrack-17": (*_columns("nose - skull_tip"), *_COCO[3:]),
     # Kinect's second version, NTU RGB+D: 3 is the middle of the head.
     "Kinect-25": _columns(
         "HumanoidRoot - - - l_shoulder l_elbow l_wrist - r_shoulder r_elbow r_wrist - "

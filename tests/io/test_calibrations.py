@@ -1173,6 +1173,12 @@ def test_what_a_camera_file_leaves_open_is_told(tmp_path: Path) -> None:
         ("a.yaml", "a: [" + "1, " * 2**21 + "1]", "more than 4,194,304 bytes; not a calibration"),
         ("a.xml", "<document><chunk/></document>", "save each camera's calibration"),
         ("a.sfm", "{}", "Meshroom's; give K"),
+        ("dlt.csv", "1.5,2\n" * 11, "11 coefficients of a DLT"),
+        ("dlt.txt", "1.5 " * 11, "11 coefficients of a DLT"),
+        ("a.csv", "a,b\n1,2\n", "numbers below their names .* found 2 rows such as 'a,b'"),
+        ("a.csv", "#name,x,y,alt,heading,pitch,roll,f\n1.jpg,1,2,3,4,5,6,35\n", "RealityCapture's"),
+        ("a.xmp", "<x xmlns:xcr='http://www.capturingreality.com/'/>", "RealityCapture's; give K"),
+        ("a.json", '{"sfm_data_version": "0.3", "intrinsics": []}', "openMVG's; give K"),
     ],
 )
 def test_calibrations_of_other_kinds(tmp_path: Path, name: str, text: str, words: str) -> None:

@@ -174,12 +174,24 @@ _MOST_YAML = 2**22
 _DEEPEST = 50
 """Brackets in brackets of a calibration in YAML."""
 
+_BY_HAND = "give K, image_size_wh and distortion in a cameras.json, or COLMAP's cameras.txt"
 _OTHERS = {
-    ".sfm .abc": "Meshroom's; give K, image_size_wh and distortion in a cameras.json",
-    ".pickle .pkl .p": "a pickle, from which code may run: not read; save K, dist, R and t with "
+    r"\.(sfm|abc)$": f"Meshroom's; {_BY_HAND}",
+    r"\.(pickle|pkl|p)$": "a pickle, from which code may run: not read; save K, dist, R and t with "
     "numpy.savez",
+    "Camera-system parameters": "Kalibr's report; give the camchain.yaml beside it",
+    r"<document[^>]*>\s*<chunk": "Metashape's cameras of a project; save each camera's calibration "
+    "as Agisoft's XML (Tools, Camera Calibration)",
+    "capturingreality|^#? ?name,x,y,": f"RealityCapture's; {_BY_HAND}",
+    "sfm_data_version": f"openMVG's; {_BY_HAND}",
+    '"projection_type"[^}]*"focal': f"OpenSfM's; {_BY_HAND} (opensfm export_colmap)",
+    "^# Bundle file": f"Bundler's; {_BY_HAND}",
+    r"camera matrix K \[3x3\]": f"Pix4D's; {_BY_HAND}",
 }
-"""Files of other kinds by how their names end, and what to do."""
+"""Files of other kinds by how their names end, or by what they begin with, and what to do."""
+
+_DLT = 11
+"""Coefficients of a camera in the direct linear transformation."""
 
 _KINDS_OF_VICON = names_in("TYPE DISPLAY_TYPE SYSTEM")
 """Where it says whether a camera films or sees markers alone."""
@@ -213,8 +225,9 @@ def read_entries(path: Path) -> dict[str, Entry]:
     """
     if path.is_dir():
         return _read_folder(path)
-    for suffixes, what in _OTHERS.items():
-        if path.name.lower().endswith(tuple(suffixes.split())) and path.is_file():
+    said = read_bytes(path, CameraError, 2048).decode(errors="replace")
+    for pattern, what in _OTHERS.items():
+        if re.search(pattern, path.name.lower() if "$" in pattern else said):
             raise CameraError(f"{path}: {what}")
     if path.name.lower().endswith(".qca.txt"):
         return _read_qualisys(path)
@@ -646,8 +659,6 @@ def _in_metres(entries: dict[str, Entry], is_anipose: bool) -> dict[str, Entry]:
 def _read_text(path: Path) -> dict[str, Entry]:
     """COLMAP's cameras, a matrix alone, or numbers below or behind what they are (ROS, KITTI)."""
     text = read_text(path, CameraError)
-    if "Camera-system parameters" in text:
-        raise CameraError(f"{path}: Kalibr's report; give the camchain.yaml beside it")
     lines = {
         f"{path}: line {number}": line.strip(" \t,;[]")
         for number, line in enumerate(text.splitlines(), start=1)
@@ -667,6 +678,13 @@ def _read_text(path: Path) -> dict[str, Entry]:
     if _has_camera(values) or _numbered(values):
         return _alone(path, values)
     rows = {w: re.split(r"[\s,;]+", line) for w, line in lines.items()}
+    if not any(re.search("[A-Z]{3}", row[1]) for row in rows.values() if len(row) > 3):
+        what = f"found {len(rows)} rows such as {shortened(next(iter(lines.values()), ''))}"
+        numbers = re.fullmatch(r"[-+0-9.eE\s,;]+", "".join(lines.values()))
+        if numbers and _DLT in (len(rows), *map(len, rows.values())):
+            what = "it looks like the 11 coefficients of a DLT, which tell of no image size"
+        known = "K, P (3 x 4), numbers below their names (KITTI) or COLMAP's cameras"
+        raise CameraError(f"{path}: expected {known}; {what}; {_BY_HAND}")
     return _with_places(path, _colmap_entries(rows), _said_unit(text))
 
 
@@ -902,11 +920,6 @@ def _listed(value: Any) -> Any:
 def _read_xml(path: Path) -> dict[str, Entry]:
     """What OpenCV and OpenPose store as XML."""
     root = parse_xml(path, "OpenCV's XML", CameraError)
-    if root.tag == "document" and root.find("chunk") is not None:
-        raise CameraError(
-            f"{path}: Metashape's cameras of a project; save each camera's calibration as "
-            "Agisoft's XML (Tools, Camera Calibration)"
-        )
     found: dict[str, Any] = {}
     for element in root:
         parts = {part.tag: (part.text or "").split() for part in element}

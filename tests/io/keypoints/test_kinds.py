@@ -2024,3 +2024,60 @@ def test_frames_that_stand_in_people(tmp_path: Path, form: str) -> None:
     write(tmp_path / "a.json", {"person_1": [flat(t) for t in T], "person_2": [flat(0)]})
     with pytest.raises(KeypointError, match="person_1, person_2: expected as many frames"):
         read(tmp_path / "a.json")
+
+
+def test_posetrack_without_its_names(tmp_path: Path) -> None:
+    """Nose, neck, top of the head, and ears that are never marked, as many joints as COCO has."""
+    rows = np.stack([person(t) for t in T])
+    rows[:, 1:3, :2] = rows[:, :1, :2] + [(0, 35), (0, -30)]
+    rows[:, 3:5] = 0
+    content = {
+        "images": [{"id": 1000 + t, "file_name": f"images/val/000342/{t:06d}.jpg"} for t in T],
+        "annotations": [
+            {"image_id": 1000 + t, "track_id": 0, "keypoints": rows[t].ravel().tolist()} for t in T
+        ],
+    }
+    found = read(write(tmp_path / "a.json", content))
+    check(found)
+    assert "l_eye" not in found.names
+    np.testing.assert_allclose(found.positions[2, found.names.index("skull_tip")], (326, 72))
+    rows[:, 1:3, :2] = rows[:, :1, :2] + [(6, -6), (-6, -6)]  # eyes of one whose ears are hidden
+    np.save(tmp_path / "a.npy", rows)
+    assert "l_eye" in read(tmp_path / "a.npy").names
+
+
+def test_a_joint_with_what_is_visible_and_a_confidence(tmp_path: Path) -> None:
+    rows = [[t, *np.insert(person(t), 2, 1.0, axis=1).flat] for t in T]
+    found = read(
+        write(tmp_path / "a.csv", wide(["frame", *ends("_x", "_y", "_vis", "_conf")], rows))
+    )
+    check(found)
+    assert float(found.confidence[0, 0]) == pytest.approx(0.6)
+
+
+def test_long_tables_whose_places_are_called_after_the_joint(tmp_path: Path) -> None:
+    heads = ["frame", "x", "y", "keypoint_name", "keypoint_x", "keypoint_y", "score"]
+    rows = [[t, 1, 2, name, *joint] for t in T for name, joint in zip(TFJS, person(t), strict=True)]
+    check(read(write(tmp_path / "a.csv", wide(heads, rows))))
+
+
+def test_long_tables_of_body_hands_and_face(tmp_path: Path) -> None:
+    heads = ["frame", "row_id", "type", "landmark_index", "x", "y", "z"]
+    fractions = [(person(t, ALIASES["MediaPipe-33"])[:, :2] + 0.5) / SIZE for t in T]
+    rows = [
+        [t, f"{t}-{part}-{n}", part, n, *((0.5, 0.5) if part != "pose" else fractions[t][n]), 0]
+        for t in T
+        for part, count in (("face", 468), ("left_hand", 21), ("pose", 33))
+        for n in range(count)
+    ]
+    found = read(write(tmp_path / "a.csv", wide(heads, rows)))
+    check(found)
+    assert "rows left out: face, lefthand" in found.report
+
+
+def test_landmarks_in_a_result(tmp_path: Path) -> None:
+    joints = np.stack([person(t, ALIASES["MediaPipe-33"]) for t in T]) + np.array([0.5, 0.5, 0])
+    marks = [[dict(zip(("x", "y", "visibility"), each, strict=True)) for each in joint / (*SIZE, 1)]
+             for joint in joints]  # fmt: skip
+    frames = [{"frame": t, "result": {"pose_landmarks": [marks[t]]}} for t in T]
+    check(read(write(tmp_path / "a.json", frames)))

@@ -43,7 +43,7 @@ from torchcss.joint_names import ALIASES, names_in
 PEOPLE = names_in(
     "people bodies instances instanceinfo predictions annots poses persons players detections body"
 )
-_OBJECTS = names_in("bodylist objects skeletons skeleton")
+_OBJECTS = names_in("bodylist objects skeletons skeleton result results")
 """The same, where no joints stand beside it: other programs' objects are boxes."""
 
 JOINTS = names_in(
@@ -91,7 +91,7 @@ def people_of(where: str, value: Any, *, alone: bool = False) -> list[Person]:
             if isinstance(inner, list) and inner and not is_joints(inner) and not _flat(inner):
                 return people_of(f"{where}: {key}", scored(inner, value))
             return one_person(f"{where}: {key}", inner, value)
-        if (key := key_of(value, _OBJECTS)) is not None and isinstance(value[key], list):
+        if (key := key_of(value, _OBJECTS)) is not None and isinstance(value[key], (list, dict)):
             return people_of(f"{where}: {key}", value[key])
         named = {key: each for key, each in value.items() if is_joints([each])}
         rest = [each for key, each in value.items() if key not in named]

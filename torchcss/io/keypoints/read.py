@@ -575,6 +575,17 @@ _MIDDLES = {
 """Joints of layouts that stand in the middle of two others: hips, shoulders, and spine of both."""
 
 
+_POSETRACK = "PoseTrack-17"
+
+
+def _has_head(chosen: np.ndarray) -> bool:
+    """Whether joints 0 to 4 are nose, neck, top of the head and no ears; or nose, eyes and ears."""
+    seen = chosen[(chosen[:, :3, 2] > 0.0).all(1), :3, :2]
+    down, up = (seen[:, end] - seen[:, 0] for end in (1, 2))
+    beyond = (down * up).sum(-1) < 0.0
+    return bool(len(seen) and not (chosen[:, 3:5, 2] > 0.0).any() and beyond.mean() > 0.5)
+
+
 def _recognise(chosen: np.ndarray) -> tuple[str, str]:
     """Return the layout of unnamed joints and why.
 
@@ -599,6 +610,9 @@ def _recognise(chosen: np.ndarray) -> tuple[str, str]:
             return layout, f"by its {num_joints} joints, {why}"
         refuted = refuted or why
     plain = [each for each in candidates if each not in _MIDDLES]
+    if _POSETRACK in plain and _has_head(chosen):
+        why = "of which 0 stands between 1 and 2, and 3 and 4, the ears, are never there"
+        return _POSETRACK, f"by its {num_joints} joints, {why}"
     if not plain:
         raise KeypointError(
             f"{num_joints} joints without names, of which it is not clear whether they are those "

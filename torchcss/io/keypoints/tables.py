@@ -67,6 +67,9 @@ _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)s?(_|(?=[0-9])))+"
 _OF_BODY_PARTS = re.compile("hand|face|finger")
 """What points beside those of a numbered body are called."""
 
+_BODY = {*names_in("pose body poselandmarks")}
+"""What the body is called among them."""
+
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
 _NUMBER = re.compile(r"([-+]?[0-9.,]+([eE][-+]?[0-9]+)?|nan)$")
@@ -121,7 +124,8 @@ def people_of_rows(rows: list[Row]) -> People:
     heading = rows[0][1]
     if VIA_SHAPE in heading:
         return read_via_table(heading, rows[1:])
-    columns = _headed(heading)
+    columns, report = _headed(heading), []
+    rows = rows if columns.joint is None else _of_the_body(rows, columns.joint, report)
     video = words.first_of({cell: n for n, cell in enumerate(heading)}, words.VIDEOS)
     if video is not None:
         check_one_video({"".join(row[video : video + 1]) for _, row in rows[1:]} - {""})
@@ -137,7 +141,7 @@ def people_of_rows(rows: list[Row]) -> People:
         columns = columns._replace(frame=0)
     elif len(who) == 1 < len(rows) - 1 and said and not "".join(*who)[:1].isdecimal():
         columns = columns._replace(frame=None, time=None)  # the name of the video
-    report = _told(columns, heading)
+    report += _told(columns, heading)
     joints, frames = _read_rows(columns, rows[1:])
     if columns.time is not None:
         frames = in_seconds(columns.time, frames)
@@ -152,6 +156,18 @@ def people_of_rows(rows: list[Row]) -> People:
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
     size = _said_size(heading, rows[1:])
     return People(people, names, report, first=first, by_hand=heading == [*_HAND], size_wh=size)
+
+
+def _of_the_body(rows: list[Row], joint: int, report: list[str]) -> list[Row]:
+    """Those of the body, where a column says of which of Holistic's parts a landmark is."""
+    body = rows[1:]
+    for column in {*range(min(len(row) for _, row in body))} - {joint}:
+        parts = [words.plain_word(row[column]) for _, row in body]
+        others = sorted({*parts} - _BODY)
+        if 0 < len(others) < len({*parts}) and all(map(_OF_BODY_PARTS.search, others)):
+            report.append(f"rows left out: {', '.join(others)}")
+            return [rows[0], *(r for r, part in zip(body, parts, strict=True) if part in _BODY)]
+    return rows
 
 
 def _said_size(heading: Sequence[str], rows: Sequence[Row]) -> tuple[float, float] | None:
@@ -251,7 +267,7 @@ def _heads_a_table(names: Iterable[str]) -> bool:
     split = [_split(_head(name)) for name in names]
     said = dict.fromkeys(names, 1)
     named = bool(words.first_of(said, words.JOINT_WORDS) and words.first_of(said, _WHEN))
-    own = [each for each in split if each is not None and (each[0] or named)]
+    own = [each[:2] for each in split if each is not None and (each[0] or named)]
     return any((joint, 0) in own and (joint, 1) in own for joint, _ in own)
 
 
@@ -356,15 +372,19 @@ def _headed(heading: Sequence[str]) -> _Columns:
     if not any(each is not None and each[1] == 1 for each in split):  # u and v
         split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
     columns: dict[tuple[str, str], dict[int, int]] = {}
-    # Pixels before fractions, where a table has both.
+    # Pixels before fractions, and the better of two confidences, where a table has both.
+    there = {index: each for index, each in enumerate(split) if each is not None}
     ranks = [1 - bool(_PIXELS.search(cell)) + bool(_FRACTIONS.search(cell)) for cell in heading]
-    for index, each in sorted(enumerate(split), key=lambda each: ranks[each[0]]):
-        if each is not None:
-            own = columns.setdefault(("", each[0]), {})
-            twice = each[1] in own and ranks[index] == ranks[own[each[1]]]
-            if twice and each[1] != 3 and each[0]:
-                raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
-            own.setdefault(each[1], index)
+    rank = {index: (ranks[index], each[2]) for index, each in there.items()}
+    for index in sorted(there, key=rank.__getitem__):
+        name, part, _ = there[index]
+        own = columns.setdefault(("", name), {})
+        if part in own and rank[index] == rank[own[part]] and part != 3 and name:
+            raise KeypointError(f"row 1: column {heading[index]!r} is there twice")
+        own.setdefault(part, index)
+    if joint is not None:  # of the joint that the row names; x and y alone are maybe a box's
+        for person, word in [each for each in columns if re.fullmatch(_POINTS, f"{each[1]}_")]:
+            columns["", ""] = {**columns.get(("", ""), {}), **columns.pop((person, word))}
     half = [joint for (_, joint), parts in columns.items() if len({0, 1} & set(parts)) == 1]
     if numbers := [joint for joint in half if joint.isdecimal()]:
         raise KeypointError(f"row 1: joint {numbers[0]} has x or y, not both")
@@ -387,20 +407,25 @@ def _headed(heading: Sequence[str]) -> _Columns:
     return _Columns(columns, len(heading), frame, None, track, time)
 
 
-def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int] | None:
-    """Joint and kind of number of a column, whichever comes first in its name."""
+def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int, int] | None:
+    """Joint, kind of number and rank as a confidence of a column; either may begin its name."""
     parted = [word for word in re.split(r"[\W_]+", re.sub(CASE, " ", cell).lower()) if word]
     if not _IN_SPACE.isdisjoint(parted):
         return None
     parted = [word for word in parted if word not in _UNITS]
     if match := re.fullmatch(r"([a-z]+)_?([0-9]+)", "_".join(parted)):  # x1, v33
-        return (match[2], kinds[match[1]]) if match[1] in kinds else None
+        return (match[2], *_kind(match[1], kinds)) if match[1] in kinds else None
     for part, joint in (
         (parted[-2:], parted[:-2]), (parted[-1:], parted[:-1]), (parted[:1], parted[1:])
     ):  # fmt: skip
         if "".join(part) in kinds:
-            return re.sub(f"^{_POINTS}(?=.)", "", "_".join(joint)), kinds["".join(part)]
+            name = re.sub(f"^{_POINTS}(?=.)", "", "_".join(joint))
+            return name, *_kind("".join(part), kinds)
     return None
+
+
+def _kind(word: str, kinds: Mapping[str, int]) -> tuple[int, int]:
+    return kinds[word], words.CONFIDENCES.index(word) if kinds[word] == 2 else 0
 
 
 def _deeplabcut(rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]]:
