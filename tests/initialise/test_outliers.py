@@ -13,7 +13,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import TrackingCost
-from torchcss.initialise.multi_start import StartSearch
+from torchcss.initialise.multi_start import PAPERS, StartSearch, optimise
 from torchcss.initialise.outliers import (
     best_distinct,
     capped_cost,
@@ -63,6 +63,15 @@ def test_a_mark_that_is_elsewhere_is_left_out_and_no_other(name: str):
         spoilt, best_distinct(refine_fits(spoilt, someone.state[None], search)), search
     )
     assert torch.nonzero(outliers)[:, 0].tolist() == [mark]
+
+
+def test_as_printed_nothing_is_widened_on_the_way():
+    """Section 5 [IJRR]: one descent; with the lengths held it goes on at the keypoints' scale."""
+    someone, cost = person_and_cost()
+    start = someone.body.bounds.project(someone.state[None] + 0.3)
+    plain = optimise(cost, start, someone.body.bounds, 60, tolerance=1e-3)
+    assert torch.equal(refine_fits(cost, start, PAPERS).mean, plain.mean)
+    assert not torch.equal(refine_fits(cost, start, StartSearch()).mean, plain.mean)
 
 
 def test_where_very_many_marks_do_not_fit_none_is_left_out(generator: torch.Generator):

@@ -153,9 +153,9 @@ def without(cost: TrackingCost, outliers: Bool[Tensor, "*b j"]) -> TrackingCost:
 
 
 def refine_fits(cost: TrackingCost, x: Vectors, search: StartSearch) -> Modes:
-    """Descend from fits to other keypoints or lengths: wide at first, then to the end."""
+    """Descend from fits to other keypoints or lengths, wide at first if the search anneals."""
     bounds = search.bounds(cost.body)
-    x = descend_widened(cost, x, bounds, ((4.0, 8),))
+    x = descend_widened(cost, x, bounds, ((4.0, 8),) if search.anneal else ())
     return optimise(cost, x, bounds, 60, tolerance=1e-3)
 
 
