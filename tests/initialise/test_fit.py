@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ from torchcss.initialise.multi_start import (
     multi_start_fits,
 )
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
-from torchcss.initialise.result import Initialisation, hang_on_best, stature_of
+from torchcss.initialise.result import Initialisation, hang_on_best, stature_of, with_uncapped
 from torchcss.initialise.view import CameraView
 from torchcss.joint_names import LIMB_JOINTS
 from torchcss.show.initialisation_views import proportion_table
@@ -46,7 +47,7 @@ from torchcss.studies.random_person import RandomPerson, person_coverage, random
 from torchcss.studies.render.clutter import clutter_background
 from torchcss.studies.render.renderer import Mesh, render_meshes
 from torchcss.studies.render.scene import look_at
-from torchcss.types import Keypoints, Modes
+from torchcss.types import Keypoints, LocalModel, Modes
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
@@ -166,6 +167,16 @@ def test_covariances_are_those_of_modes_with_unknown_lengths(found: Initialisati
     wider = torch.linalg.eigvalsh((found.uncapped - covariance)[free][:, free])
     assert float(wider[0]) > -1e-9
     assert float(wider[-1]) > 0
+
+
+@pytest.mark.parametrize(("curvature", "floored"), [(2.0, False), (-1.0, True)])
+def test_a_first_covariance_says_whether_it_was_floored(
+    found: Initialisation, curvature: float, floored: bool
+):
+    hessian = curvature * torch.eye(found.body.num_parameters).to(found.body.tie)[None]
+    model = LocalModel(hessian[:, 0, 0], torch.zeros_like(hessian[:, 0]), hessian)
+    cost: Any = SimpleNamespace(body=found.body, local_model=lambda _: model)
+    assert with_uncapped(found, cost, StartSearch()).uncapped_floored == floored
 
 
 def test_hypotheses_are_the_fits_and_then_samples(found: Initialisation):

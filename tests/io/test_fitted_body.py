@@ -71,13 +71,15 @@ def test_round_trip(found: Initialisation, generator: torch.Generator, tmp_path:
             found.body.surface(ours).points, back.body.surface(theirs).points
         )
         assert back.uncapped is None
+        assert not back.uncapped_floored
     assert read_fitted_body(tmp_path, dtype=torch.float32).mixture.mean.dtype == torch.float32
     uncapped = 3 * found.mixture.covariance[0]
-    some = found._replace(uncapped=uncapped)
+    some = found._replace(uncapped=uncapped, uncapped_floored=True)
     write_fitted_body(tmp_path / "body.npz", some, camera(generator))
     back = read_fitted_body(tmp_path)
     assert back.uncapped is not None
     assert torch.equal(back.uncapped, uncapped)
+    assert back.uncapped_floored
 
 
 def test_keeps_its_place_before_another_camera(

@@ -15,7 +15,7 @@ import pytest
 import torch
 from made_clip import grey_film
 from made_sequences import rendered_arm, write_clip
-from made_sessions import seen_by, session_at, start_at
+from made_sessions import INTERVAL, moving_arm, seen_by, session_at, start_at
 from torch import Tensor
 
 import torchcss
@@ -314,6 +314,23 @@ def test_the_papers_start_from_one_fit_whose_covariance_nothing_caps():
         torch.testing.assert_close(
             covariance.diagonal()[free], torch.full_like(covariance.diagonal()[free], variance)
         )
+
+
+@pytest.mark.parametrize(("preset", "more"), [("ijrr_single_limits", 1), ("css", 0)])
+def test_a_first_covariance_that_was_floored_is_counted(preset: str, more: int):
+    """In the first frame, where a track starts from it."""
+    arm = moving_arm(2)
+    first = start_at(arm.body, arm.states[0])
+    first = first._replace(uncapped=first.mixture.covariance[0])
+    settings = Settings(preset=preset, body=arm.body.name, samples=1, engine="eager")
+
+    def counts(floored: bool) -> list[int]:
+        start = first._replace(uncapped_floored=floored)
+        session = TrackingSession(settings, start, seen_by(arm.camera), frame_interval=INTERVAL)
+        return [int(frame.info.num_floored) for frame in session.track(arm.frames)]
+
+    plain, floored = counts(floored=False), counts(floored=True)
+    assert floored == [plain[0] + more, plain[1]]
 
 
 @pytest.mark.parametrize("preset", ["ijrr_css", "ijrr_css_spherical", "ijrr_cham_rehg"])

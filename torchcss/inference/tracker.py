@@ -141,7 +141,8 @@ class TrackerInfo(NamedTuple):
         effective_sample_size: `1 / sum w^2` over the weights of the distinct modes, a scalar: how
             many modes share the posterior.
         num_floored: Ends of descents whose covariance needed `LEAST_CURVATURE`, see
-            `constrained_inverse`, a scalar; 0 for trackers that cap all covariances.
+            `constrained_inverse`, a scalar; 0 for trackers that cap all covariances. In the first
+            frame of a track that starts from one fit's covariance it counts that too.
         survival: How evenly the samples' importance weights are spread: those back to the prior
             for samples that descend (section 8 [IJRR]), those of the posterior for particles.
         prior: The prior of the frame: the modes before, one frame ahead, and where moves led.

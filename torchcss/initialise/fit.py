@@ -57,8 +57,8 @@ from torchcss.initialise.result import (
     hang_on_best,
     scale_report,
     spread_to,
-    uncapped_covariance,
     with_lengths,
+    with_uncapped,
     with_unknown_lengths,
 )
 from torchcss.initialise.shape import ShapeFit, fit_shape
@@ -318,7 +318,7 @@ def _with_contours(
     )  # fmt: skip
     third = Stage("all parameters, with contours", body, kept.mean[0], float(kept.cost[0]))
     scale_line = partial(scale_report, options.stature, num_views=len(cost.views))
-    return first._replace(
+    found = first._replace(
         body=body,
         mixture=result.mixture,
         cost=result.cost,
@@ -329,9 +329,9 @@ def _with_contours(
             scale_line(lengths),
         ),
         lengths=lengths,
-        uncapped=uncapped_covariance(cost, body, kept.mean[0], search),
         stages=(*first.stages, second, third),
     )
+    return with_uncapped(found, cost, search)
 
 
 def _outlines(cost: TrackingCost) -> tuple[Outline, ...]:

@@ -19,8 +19,6 @@ from __future__ import annotations
 from itertools import compress
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
@@ -44,9 +42,9 @@ from torchcss.initialise.result import (
     mixture_of,
     scale_of,
     scale_report,
-    uncapped_covariance,
     undetermined,
     with_lengths,
+    with_uncapped,
     with_unknown_lengths,
 )
 from torchcss.initialise.view import CameraView
@@ -98,8 +96,7 @@ def fit_joints(
         _check_in_view(body, view.camera)
         fits = multi_start_fits(cost, search=options.search, generator=generator)
         kept = best_distinct(fits, options.num_modes)
-        uncapped = uncapped_covariance(cost, body, kept.mean[0], options.search)
-        return as_initialisation(body, kept, notes)._replace(uncapped=uncapped)
+        return with_uncapped(as_initialisation(body, kept, notes), cost, options.search)
     free = hang_before_camera(free, view.camera, match_joints(keypoints, free.joint_names))
     return _with_lengths_fitted(cost.with_body(free), generator, options, scale, notes)
 
@@ -119,8 +116,8 @@ def _with_lengths_fitted(
         notes = (*notes, f"keypoints that fit no pose, left out: {', '.join(left_out)}")
         cost = without(cost, outliers)
     lengths = fitted_lengths(free, fits.mean[0], options.stature)
-    held, kept, uncapped, loose = _with_lengths_held(cost, fits, lengths, scale, options)
-    result = as_initialisation(held, kept, notes)
+    cost, held, kept, loose = _with_lengths_held(cost, fits, lengths, scale, options)
+    result = with_uncapped(as_initialisation(held, kept, notes), cost, options.search)
     report = [*result.report, scale_report(options.stature, lengths, num_views=len(cost.views))]
     if loose:
         what = "kept at their prior" if has_root(held) else "as its place was sought as well"
@@ -135,7 +132,6 @@ def _with_lengths_fitted(
         free_body=free,
         free_mixture=mixture_of(fits),
         size_deviation=0.0 if known else Anthropometric().stature,
-        uncapped=uncapped,
     )
 
 
@@ -145,12 +141,12 @@ def _with_lengths_held(
     lengths: dict[str, float],
     scale: float,
     options: InitialiseOptions,
-) -> tuple[BodyModel, Modes, Float[Tensor, "n n"], list[str]]:
+) -> tuple[TrackingCost, BodyModel, Modes, list[str]]:
     """Refine fits on the body with these lengths.
 
     Returns:
-        The body hung on the best of them, the distinct fits, the covariance of the best uncapped,
-        and the parameters that the joints do not determine.
+        The cost with the lengths free again, for a body with a root; the body hung on the best of
+        them, the distinct fits, and the parameters that the joints do not determine.
     """
     free, num = cost.body, options.num_modes
     # Twice as many fits as are asked for have their chance.
@@ -178,7 +174,7 @@ def _with_lengths_held(
         cost = cost.with_body(free)
     else:
         cost = cost.with_body(body)
-    return body, kept, uncapped_covariance(cost, body, kept.mean[0], search), loose
+    return cost, body, kept, loose
 
 
 def _check_in_view(body: BodyModel, camera: Camera) -> None:

@@ -73,8 +73,9 @@ class Initialisation(NamedTuple):
         noise: How many times as noisy as was assumed keypoints were found to be.
         size_deviation: What is not known of a person's size, as the deviation of its logarithm;
             zero if the stature was given, or several cameras looked on.
-        uncapped: Covariance of the best fit that no prior caps (`uncapped_covariance`), from which
+        uncapped: Covariance of the best fit that no prior caps (`with_uncapped`), from which
             the papers' trackers start; None: that of the mixture.
+        uncapped_floored: Whether `torchcss.linalg.LEAST_CURVATURE` was needed for it.
     """
 
     body: BodyModel
@@ -90,6 +91,7 @@ class Initialisation(NamedTuple):
     noise: float = 1.0
     size_deviation: float = Anthropometric().stature
     uncapped: Float[Tensor, "n n"] | None = None
+    uncapped_floored: bool = False
 
     def hypotheses(self, num: int, *, generator: torch.Generator) -> Vectors:
         """The first `num` states to believe in: the fits, then samples of their mixture.
@@ -189,21 +191,19 @@ def with_unknown_lengths(
     return fits._replace(covariance=covariance[:, columns][:, :, columns])
 
 
-def uncapped_covariance(
-    cost: TrackingCost, body: BodyModel, x: Vector, search: StartSearch
-) -> Float[Tensor, "n n"]:
-    """Covariance of a fit as the papers print it (`torchcss.linalg.constrained_inverse`).
+def with_uncapped(found: Initialisation, cost: TrackingCost, search: StartSearch) -> Initialisation:
+    """With the best fit's covariance as printed (`torchcss.linalg.constrained_inverse`).
 
     Args:
+        found: The fits on a body with lengths held.
         cost: Cost of the same body on the same base, with free lengths or with lengths held.
-        body: The body with lengths held.
-        x: The fit.
         search: Whether limits hold.
     """
-    model, free, columns = _with_lengths(cost, body, x[None], search)
+    model, free, columns = _with_lengths(cost, found.body, found.mixture.mean[:1], search)
     variance = default_prior_variance(cost.body.bounds)
-    covariance, _ = constrained_inverse(model.hessian, free, variance)
-    return covariance[0, columns][:, columns]
+    covariance, floored = constrained_inverse(model.hessian, free, variance)
+    own = covariance[0, columns][:, columns]
+    return found._replace(uncapped=own, uncapped_floored=bool(floored[0]))
 
 
 def _with_lengths(

@@ -18,6 +18,7 @@ One NPZ file, schema version 1. K hypotheses, n parameters, P parts, L lengths:
 | `neighbours` | N 2 | names of the parts that touch in every pose |
 | `state`, `covariance`, `log_weight`, `cost` | K n, K n n, K, K | the hypotheses, best first |
 | `uncapped` | n n | covariance of the best that no prior caps; may be missing |
+| `uncapped_floored` | | whether it needed a least curvature; may be missing |
 | `base_rotation`, `base_translation` | 3 3, 3 | frame in which the root moves, in the world |
 | `camera_rotation`, `camera_translation`, `camera_matrix` | 3 3, 3, 3 3 | the picture's camera |
 
@@ -84,6 +85,7 @@ def write_fitted_body(path: StrPath, found: Initialisation, camera: Camera) -> N
         "scale": found.scale,
         "noise": found.noise,
         "size_deviation": found.size_deviation,
+        "uncapped_floored": found.uncapped_floored,
         "length_names": np.array(list(found.lengths), dtype=np.str_),
         "lengths": np.array(list(found.lengths.values()), dtype=np.float64),
         "part_names": np.array(body.part_names, dtype=np.str_),
@@ -153,6 +155,7 @@ def read_fitted_body(
     # Earlier files lack these.
     return found._replace(
         uncapped=tensors.get("uncapped"),
+        uncapped_floored=bool(arrays.get("uncapped_floored", found.uncapped_floored)),
         noise=float(arrays.get("noise", found.noise)),
         size_deviation=float(arrays.get("size_deviation", found.size_deviation)),
     )

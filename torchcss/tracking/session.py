@@ -203,7 +203,7 @@ class TrackingSession:
         nothing = len(self._observers)
         mixture = first.mixture
         if self.plan.one_fit:
-            mixture = _one_fit(first, self._bounds)
+            mixture, self._num_floored = _one_fit(first, self._bounds), int(first.uncapped_floored)
         self.state = SessionState(
             tracker=self.plan.tracker.init(mixture, generator=generator),
             body=first.body,
@@ -276,6 +276,7 @@ class TrackingSession:
         self._bounds = self.plan.bounds
         self._prior_variance = default_prior_variance(self._bounds)
         self._surface_motion = SurfaceMotion(body) if self.plan.surface_prediction else None
+        self._num_floored = 0
 
     def checkpoint(self) -> SessionState:
         """All that the next frame needs; see `torchcss.tracking.checkpoint` for its tensors."""
@@ -433,7 +434,7 @@ class TrackingSession:
             frame=observation.frame,
             body=body,
             state=after,
-            info=info,
+            info=self._with_first_fit(info),
             covariance=tempered(modes.covariance, plan.tracker.stated_power, self._prior_variance),
             joints_world=body.pose(modes.mean).joints,
             terms=terms,
@@ -446,6 +447,11 @@ class TrackingSession:
             loss_score=0.0 if monitor is None else monitor.score,
             others=tuple(view.frame for view in observation.views[1:]),
         )
+
+    def _with_first_fit(self, info: TrackerInfo) -> TrackerInfo:
+        """Of the first frame: with the floor of the covariance that the track starts from."""
+        floored, self._num_floored = self._num_floored, 0
+        return info._replace(num_floored=info.num_floored + floored)
 
     def _judged(
         self, terms: dict[str, float], observation: Observation
