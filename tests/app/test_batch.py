@@ -50,7 +50,11 @@ def test_a_bad_clip_fails_alone_and_is_tried_again_when_it_has_changed(tmp_path:
     assert "bad.mp4" in told["clips"]["bad"]["about"]
     page = (tmp_path / "out" / "batch.html").read_text()
     assert re.findall("href='([^']*)'", page) == ["good/"]  # of the other there is no folder
-    assert Run.open(tmp_path / "out" / "good").settings["seed"] == 3
+    run = Run.open(tmp_path / "out" / "good")
+    assert run.settings["seed"] == 3
+    good = told["clips"]["good"]
+    assert (good["frames"], good["told_lost"]) == (len(run.track.frames), 0)
+    assert f"<td>{good['frames']}</td><td>0</td>" in page
     failed = tmp_path / "out" / ".batch" / "failed" / "bad.json"
     before = failed.stat().st_mtime_ns
     batch.run()

@@ -63,7 +63,7 @@ from torchcss.files import (
 )
 from torchcss.io.checkpoint import CHECKPOINT_NAME, read_checkpoint
 from torchcss.io.keypoints.read import Scale
-from torchcss.io.tracks import TRACK_NAME
+from torchcss.io.tracks import TRACK_NAME, read_summary
 from torchcss.io.video import VIDEO_SUFFIXES, VideoReader
 from torchcss.joint_names import names_in
 from torchcss.tracking.session import Posterior
@@ -106,14 +106,31 @@ MOST_DEATHS = 3
 
 _POLL_S = 0.5
 
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>torchcss batch</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; padding: 1rem; }}
+th, td {{ text-align: left; vertical-align: top; padding: .2rem .8rem .2rem 0;
+  overflow-wrap: break-word; }}
+th {{ border-bottom: 1px solid #ddd; }}
+</style></head><body>
+<h1>{summed}</h1>
+<table>
+<tr><th>clip<th>state<th>frames<th>told lost<th>seconds a frame<th></tr>
+{rows}</table>
+</body></html>
+"""
+
 
 @frozen
 class Batch:
     """Track many clips; the same command goes on with what was interrupted."""
 
     manifest: Annotated[Path, tyro.conf.Positional]
-    """CSV or JSON with the columns video, camera, keypoints, name and options; or a folder of
-    folders that hold video.mp4, cameras.json and keypoints.npz, or of videos."""
+    """CSV or JSON with a column video, and others for what differs: camera, keypoints, name, start,
+    stop, stature, seed and so on; or a folder of folders that hold video.mp4, cameras.json and
+    keypoints.npz, or of videos."""
     out: Path = Path("out/batch")
     """Folder of the results, one folder a clip."""
     workers: int = 1
@@ -456,25 +473,35 @@ class Job(NamedTuple):
         with suppress(OutputError):
             write_text(self._failed(clip), json.dumps(about))
 
+    def _outcome(self, name: str) -> dict[str, Any]:
+        """What there is to know of a clip that is done, as far as its summary tells."""
+        summary = {}
+        with suppress(TorchcssError):
+            summary = read_summary(self.out / name)
+        return {
+            "frames": summary.get("num_frames", ""),
+            "told_lost": sum(event["event"] == "lost" for event in summary.get("events", ())),
+            "seconds_per_frame": round(summary.get("seconds_per_frame", 0.0), 2),
+        }
+
     def report(self) -> str:
         """Write `batch.json` and `batch.html`; how many clips ended how."""
         states = self.states()
         kinds = [state.kind for state in states.values()]
         counts = {kind: kinds.count(kind) for kind in ("done", "failed", "tracking", "waiting")}
-        plain = {name: state._asdict() for name, state in states.items()}
-        write_text(self.out / "batch.json", json.dumps({**counts, "clips": plain}, indent=1))
-        rows = ""
-        for name, state in states.items():
-            called = html.escape(name)
-            if state.kind == "done":  # of others there is no folder
-                called = f"<a href='{quote(name)}/'>{called}</a>"
-            about = html.escape(state.about)
-            rows += f"<tr><td>{called}</td><td>{state.kind}</td><td>{about}</td></tr>\n"
-        head = "<!doctype html><meta charset='utf-8'><title>batch</title>"
-        style = "<style>body{font:15px sans-serif}td{padding:2px 12px}</style>"
-        write_text(self.out / "batch.html", f"{head}{style}<table>\n{rows}</table>\n")
-        failed = [f"{name}: {s.about}" for name, s in states.items() if s.kind == "failed"]
         summed = ", ".join(f"{number} {kind}" for kind, number in counts.items() if number)
+        plain, rows = {}, ""
+        for name, state in states.items():
+            called, told = html.escape(name), {}
+            if state.kind == "done":  # of others there is no folder
+                told = self._outcome(name)
+                called = f"<a href='{quote(name)}/'>{called}</a>"
+            plain[name] = {**state._asdict(), **told}
+            cells = called, state.kind, *(told.values() or 3 * [""]), html.escape(state.about)
+            rows += f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>\n"
+        write_text(self.out / "batch.json", json.dumps({**counts, "clips": plain}, indent=1))
+        write_text(self.out / "batch.html", _PAGE.format(summed=summed, rows=rows))
+        failed = [f"{name}: {s.about}" for name, s in states.items() if s.kind == "failed"]
         return "\n".join([*failed, f"{summed}; see {self.out / 'batch.html'}"])
 
 
