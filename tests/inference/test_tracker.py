@@ -652,6 +652,35 @@ def test_covariances_as_printed_are_not_capped(generator):
         assert int(info.num_floored) == 0
 
 
+def test_steps_3_to_6_of_figure_6_by_hand(generator):
+    """The K likeliest in this frame alone; then the weight of the prior mode next to each."""
+
+    def egg_box(x):
+        near = 0.05 * (x - 0.5).square().sum()
+        return near - 3 * torch.cos(2 * x[0]) - 2 * torch.cos(2 * x[1])
+
+    weight = torch.tensor([0.6, 0.3, 0.1]).double()  # the cheapest minimum was the least before
+    places = torch.tensor([[3.0, 0.0], [0.0, 3.0], [0.0, 0.0]]).double()
+    before = GaussianMixture(places, 0.3 * torch.eye(2).double().expand(3, 2, 2), weight.log())
+    problem = SearchProblem(problems.AutogradCost(egg_box))
+
+    def after(num_modes: int):
+        tracker = replace(PRINTED, num_samples=80, num_modes=num_modes)
+        return tracker.step(tracker.init(before, generator=generator), problem, BOUNDS)
+
+    # Of the same samples, since the generator's state is part of the tracker's.
+    (_, every), (state, info) = after(80), after(3)
+    assert int(info.num_distinct) == len(every.cost) > 6
+    torch.testing.assert_close(info.cost.sort().values, every.cost.sort().values[:3])
+    own = torch.cdist(state.mixture.mean, places).argmin(-1)
+    assert own.tolist() == info.parent.tolist() == [0, 1, 2]
+    assert int(info.cost.argmin()) == 2, "no longer in the order of cost"
+    expected = (-info.cost).exp() * weight[own]
+    torch.testing.assert_close(state.mixture.weight, expected / expected.sum())
+    hessian = problem.cost.local_model(state.mixture.mean).hessian
+    torch.testing.assert_close(state.mixture.covariance, torch.linalg.inv(hessian))
+
+
 def test_floored_covariances_are_counted(generator):
     flat = SearchProblem(
         problems.Bowl(torch.diag(torch.tensor([4.0, 0.0])).double(), torch.zeros(2).double())

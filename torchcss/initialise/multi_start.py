@@ -1,6 +1,6 @@
 """All the poses that explain the joints of one image: the many starts of the first stage.
 
-Thousands of poses explain one image of joint centres (section 7 [IJRR]). They are found from many
+Thousands of poses explain one image of joint centres (section 1 [IJRR]). They are found from many
 starts in three batches, every descent bound by the joint limits:
 
 1. *Around the vertical.* Poses about the stabilisers' rest, turned through the full circle, descend

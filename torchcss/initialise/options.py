@@ -92,7 +92,7 @@ class InitialiseOptions:
             )
 
     def as_papers(self) -> InitialiseOptions:
-        """The same, with the three stages of section 5 [IJRR] and nothing of ours.
+        """The same, with the three stages of section 5 [IJRR]; of ours is the cost of the edges.
 
         One fit from a coarse pose to joints and edges, with limits, stabilisers, proportions and
         repulsion.

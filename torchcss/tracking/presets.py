@@ -282,7 +282,7 @@ PRESETS: dict[str, Preset] = {
     "ijrr_css": _IJRR_CSS,
     "ijrr_css_heavy_tailed": replace(
         _IJRR_CSS,
-        what="covariance scaled sampling with Student t tails ([IJRR] Fig. 6)",
+        what="covariance scaled sampling with Student t tails ([IJRR] Fig. 8d)",
         proposal=HeavyTailed(covariance_scale=4.0, degrees_of_freedom=3, include_modes=False),
     ),
     "ijrr_css_spherical": replace(
