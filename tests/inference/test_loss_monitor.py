@@ -17,8 +17,9 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import ScaledProposal
 from torchcss.inference.tracker import Tracker
-from torchcss.tracking.presets import PRESETS, make_tracker
+from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.recovery import Recovery
+from torchcss.tracking.settings import Settings, make_tracker
 
 MONITOR = LossMonitor()
 
@@ -158,7 +159,7 @@ def test_a_window_holds_what_is_learnt_before_anything_is_judged():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator: torch.Generator):
-    narrow = make_tracker(preset, "arm8", num_samples=10, num_modes=2, motion=0.1)
+    narrow = make_tracker(Settings(preset=preset, body="arm8", samples=10, modes=2), motion=0.1)
     wide = Recovery(samples=3, modes=2, scale=2.0).widened(narrow)
     assert type(wide) is type(narrow)
     assert wide.num_samples == 30

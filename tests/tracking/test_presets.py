@@ -30,13 +30,14 @@ from torchcss.inference.proposals import (
 )
 from torchcss.inference.tracker import Tracker
 from torchcss.robust import Leclerc, Lorentzian
-from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset, make_tracker
+from torchcss.tracking.presets import OLD_NAMES, PRESETS, Preset
 from torchcss.tracking.settings import (
     PAPER_TERMS,
     TERMS,
     Settings,
     make_choice,
     make_extractor,
+    make_tracker,
     settings_from_plain,
 )
 from torchcss.types import Bounds, Curvature, Status
@@ -50,7 +51,7 @@ START = GaussianMixture(
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("body", ["arm8", "body34"])
 def test_every_tracker_follows_a_minimum(name, body, generator):
-    tracker = make_tracker(name, body, motion=MOTION)
+    tracker = make_tracker(Settings(preset=name, body=body), motion=MOTION)
     bounds = PRESETS[name].bounds(problems.box(2, -6, 6))
     state = tracker.init(START, generator=generator)
     wells = [problems.DoubleWell(width=0.3, tilt=-0.02 * t) for t in range(4)]
@@ -65,7 +66,7 @@ def test_every_tracker_follows_a_minimum(name, body, generator):
 
 @pytest.mark.parametrize("name", ["css", "ijrr_single_limits"])
 def test_the_first_rows_are_what_they_were(name):
-    tracker = make_tracker(name, "body34", motion=MOTION)
+    tracker = make_tracker(Settings(preset=name, body="body34"), motion=MOTION)
     assert isinstance(tracker, Tracker)
     assert isinstance(tracker.proposal, CovarianceScaled)
     assert tracker.dynamics.deviation == (MOTION if name == "css" else (0.0, 0.0))
@@ -79,28 +80,32 @@ def test_the_first_rows_are_what_they_were(name):
 
 def test_numbers_and_noise_reach_the_tracker():
     row = PRESETS["ijrr_cham_rehg"]
-    tracker = make_tracker("ijrr_cham_rehg", "arm8", num_samples=5, num_modes=4, motion=MOTION)
+    tracker = make_tracker(
+        Settings(preset="ijrr_cham_rehg", body="arm8", samples=5, modes=4), motion=MOTION
+    )
     assert isinstance(tracker, Tracker)
     assert isinstance(tracker.proposal, ChamRehg)
     assert isinstance(tracker.dynamics, ConstantVelocity)
     assert tracker.proposal.deviation == tuple(row.noise * m for m in MOTION)
     assert tracker.dynamics.deviation == 0.0
     assert (tracker.num_samples, tracker.num_modes) == (5, 4)
-    particles = make_tracker("condensation_inflated", "body34", motion=0.1)
+    particles = make_tracker(Settings(preset="condensation_inflated", body="body34"), motion=0.1)
     assert isinstance(particles, ParticleFilter)
     assert particles.dilution == 1 / 8
     assert particles.dynamics.deviation == pytest.approx(
         PRESETS["condensation_inflated"].noise * 0.1
     )
-    assert isinstance(make_tracker("annealed", "arm8"), AnnealedParticleFilter)
-    heap_hogg = make_tracker("heap_hogg", "arm8", motion=0.1)
+    assert isinstance(
+        make_tracker(Settings(preset="annealed", body="arm8")), AnnealedParticleFilter
+    )
+    heap_hogg = make_tracker(Settings(preset="heap_hogg", body="arm8"), motion=0.1)
     assert isinstance(heap_hogg, Tracker)
     assert isinstance(heap_hogg.proposal, Condensation)
 
 
 def test_weights_of_css_and_of_figure_6():
     """An arm may count evidence otherwise than a body; as printed there is no such choice."""
-    arm, body = (make_tracker("css", name) for name in ("arm8", "body34"))
+    arm, body = (make_tracker(Settings(preset="css", body=name)) for name in ("arm8", "body34"))
     assert (arm.surprise, body.surprise) == (math.inf, 5.1)
     assert isinstance(arm, Tracker)
     assert isinstance(body, Tracker)
@@ -108,7 +113,7 @@ def test_weights_of_css_and_of_figure_6():
     assert arm.soft_matching
     assert body.soft_matching
     for name in ("arm8", "body34"):
-        printed = make_tracker("ijrr_css", name)
+        printed = make_tracker(Settings(preset="ijrr_css", body=name))
         assert isinstance(printed, Tracker)
         assert (printed.likelihood_power, printed.forgetting) == (1.0, 1.0)
         assert not printed.soft_matching
@@ -119,7 +124,7 @@ def test_weights_of_css_and_of_figure_6():
 )
 def test_the_reports_numbers_of_hypotheses(body, k, directions):
     """Section 6 [RR]: three for the arm along one direction, seven for the body along three."""
-    tracker = make_tracker("rr_multiple_hypothesis", body, motion=0.1)
+    tracker = make_tracker(Settings(preset="rr_multiple_hypothesis", body=body), motion=0.1)
     assert isinstance(tracker, GridTracker)
     assert tracker.num_modes == k
     assert tracker.pattern == EigenDirectionGrid(num_directions=directions, num_steps=1)
@@ -148,7 +153,7 @@ def test_least_squares_rows_are_the_papers():
 
 def test_bad_rows_and_names():
     with pytest.raises(ConfigurationError, match=r"no tracker 'x'; there are css"):
-        make_tracker("x", "arm8")
+        make_tracker(Settings(preset="x", body="arm8"))
     with pytest.raises(ConfigurationError, match="either a proposal or a particle filter"):
         replace(PRESETS["css"], particles=PRESETS["ijrr_condensation"].particles)
     with pytest.raises(ConfigurationError, match="either"):
@@ -188,7 +193,7 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
     extractor = make_extractor(settings)
     assert (extractor.edges.window is None) == name.startswith("rr_")
     assert extractor.colour == contour.foreground
-    tracker = make_tracker(name, body, motion=0.1)
+    tracker = make_tracker(Settings(preset=name, body=body), motion=0.1)
     if isinstance(tracker, (Tracker, GridTracker)):
         optimiser = tracker.optimiser
         assert optimiser.max_steps >= 100
@@ -206,7 +211,7 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
 
 @pytest.mark.parametrize("name", CSS_ROWS)
 def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
-    tracker = make_tracker(name, "arm8", motion=0.1)
+    tracker = make_tracker(Settings(preset=name, body="arm8"), motion=0.1)
     assert isinstance(tracker, Tracker)
     proposal = tracker.proposal
     assert isinstance(proposal, (CovarianceScaled, HeavyTailed, Spherical))
@@ -226,7 +231,7 @@ def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
 @pytest.mark.parametrize("name", ["ijrr_css", "ijrr_css_heavy_tailed", "ijrr_css_spherical"])
 def test_samples_of_every_tail_lead_back_to_the_prior(name, generator):
     """Section 8 [IJRR]: weighed, they are fair samples of what they were drawn about."""
-    tracker = make_tracker(name, "arm8")
+    tracker = make_tracker(Settings(preset=name, body="arm8"))
     assert isinstance(tracker, Tracker)
     prior = START._replace(covariance=torch.diag(torch.tensor([0.04, 0.01])).double()[None])
     samples = tracker.proposal.sample(prior, 20_000, problems.unbounded(2), generator=generator)
@@ -239,7 +244,7 @@ def test_samples_of_every_tail_lead_back_to_the_prior(name, generator):
 def test_condensation_is_inflated_in_posterior_and_dynamics():
     """Section 9 [IJRR]; both are weighed back."""
     row = PRESETS["condensation_inflated"]
-    tracker = make_tracker("condensation_inflated", "body34", motion=0.1)
+    tracker = make_tracker(Settings(preset="condensation_inflated", body="body34"), motion=0.1)
     assert isinstance(tracker, ParticleFilter)
     assert (tracker.dilution, tracker.noise_scale) == (1 / 8, 8.0)
     assert (row.noise, row.terms, row.recovery) == (1.0, "papers", False)
@@ -320,7 +325,7 @@ def test_old_names_and_old_runs_still_open():
     for old, new in OLD_NAMES.items():
         assert Settings(preset=old).preset == new
         assert old not in PRESETS
-        assert make_tracker(old, "arm8") == make_tracker(new, "arm8")
+        assert Settings(preset=old) == Settings(preset=new)
     old = {"preset": "css_figure_6", "terms": ["contour", "region"], "recovery": True}
     opened = settings_from_plain(old)
     assert (opened.preset, opened.used_terms) == ("ijrr_css", ("contour", "region"))
@@ -330,13 +335,13 @@ def test_old_names_and_old_runs_still_open():
 def test_css_has_what_was_measured_to_help():
     plain = Settings()
     assert (plain.recovers, plain.keypoints_first_only, plain.used_terms) == (True, False, TERMS)
-    tracker = make_tracker("css", "arm8", motion=0.1)
+    tracker = make_tracker(Settings(preset="css", body="arm8"), motion=0.1)
     assert isinstance(tracker, Tracker)
     optimiser = tracker.optimiser
     assert (optimiser.max_steps, optimiser.tolerance) == (60, 1e-2)
     assert optimiser.initial_radius == 1 / 16
     assert (tracker.num_samples, tracker.survivors) == (160, 20)
-    body = make_tracker("css", "body34", motion=0.1)
+    body = make_tracker(Settings(preset="css", body="body34"), motion=0.1)
     assert isinstance(body, Tracker)
     assert (body.num_samples, body.survivors, body.num_modes) == (60, 15, 7)
     assert (tracker.coarse_every, tracker.keep_alike, tracker.converged_only) == (3, True, True)
@@ -349,7 +354,7 @@ def test_css_has_what_was_measured_to_help():
 
 @pytest.mark.parametrize("preset", ["css", "ijrr_css"])
 def test_what_stopped_at_the_step_limit_is_not_kept(preset, generator):
-    tracker = make_tracker(preset, "arm8", num_samples=6, num_modes=3)
+    tracker = make_tracker(Settings(preset=preset, body="arm8", samples=6, modes=3))
     assert isinstance(tracker, Tracker)
     hurried = replace(tracker, optimiser=replace(tracker.optimiser, max_steps=1))
     problem, bounds = SearchProblem(problems.DoubleWell(width=0.3)), problems.box(2, -6, 6)

@@ -46,7 +46,7 @@ from torchcss.tracking.settings import (
     all_terms,
     make_choice,
     make_plan,
-    make_settings_tracker,
+    make_tracker,
     named_terms,
 )
 from torchcss.types import Bounds, Frame
@@ -684,7 +684,7 @@ def test_awkward_frames_leave_no_nan_and_lose_nothing():
 )
 def test_how_much_a_frame_counts(asked: dict[str, Any], power: float) -> None:
     settings = Settings(**asked)
-    tracker = make_settings_tracker(settings, load_body(settings.body).motion_rate / 25)
+    tracker = make_tracker(settings, motion=0.1)
     assert tracker.stated_power == power
     if isinstance(tracker, Tracker):
         assert tracker.likelihood_power == power
@@ -693,7 +693,7 @@ def test_how_much_a_frame_counts(asked: dict[str, Any], power: float) -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_row_of_the_table_can_be_run_by_its_name(preset: str):
     settings, row = Settings(body="arm7", preset=preset, terms=all_terms()), PRESETS[preset]
-    tracker = make_settings_tracker(settings, load_body("arm7").motion_rate / 25)
+    tracker = make_tracker(settings, motion=0.1)
     assert (tracker.num_samples, tracker.num_modes) == (row.samples_arm, row.modes_arm)
     choice = make_choice(settings, 2.0)
     assert isinstance(choice.find(JointTerm).potential, Quadratic) != row.robust

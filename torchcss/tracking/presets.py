@@ -1,6 +1,6 @@
 """The trackers by name, as one table of choices: the papers' and ours.
 
-`make_tracker(name, body_name)` builds one. A row says everything: search, cost, dynamics,
+`torchcss.tracking.settings.make_tracker` builds one. A row says everything: search, cost, dynamics,
 optimiser, recovery, what keypoints are used for and where the track starts. An option that the user
 gives beside it wins (`Settings.changed`).
 
@@ -44,10 +44,7 @@ from dataclasses import field, replace
 from types import MappingProxyType
 from typing import Literal
 
-from torchcss.body.load import has_free_root
 from torchcss.errors import ConfigurationError
-from torchcss.inference.dynamics import ConstantVelocity
-from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import (
     ChamRehg,
@@ -59,7 +56,6 @@ from torchcss.inference.proposals import (
     Spherical,
     unbounded,
 )
-from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds, Curvature, frozen
 
@@ -384,67 +380,3 @@ def preset_name(name: str) -> str:
     if known not in PRESETS:
         raise ConfigurationError(f"no tracker {name!r}; there are {', '.join(PRESETS)}")
     return known
-
-
-def make_tracker(
-    preset: str,
-    body_name: str,
-    *,
-    num_samples: int | None = None,
-    num_modes: int | None = None,
-    motion: tuple[float, ...] | float = 0.0,
-    free_root: bool | None = None,
-) -> SequenceTracker:
-    """Build a tracker from the table.
-
-    Args:
-        preset: A name in `PRESETS` or `OLD_NAMES`.
-        body_name: The body; arms and bodies differ in numbers.
-        num_samples: Samples per frame instead of the table's.
-        num_modes: Modes kept instead of the table's.
-        motion: Standard deviation of every parameter's motion per frame.
-        free_root: Whether the body moves about; None: told by its name.
-
-    Raises:
-        ConfigurationError: If there is no such tracker.
-    """
-    row = PRESETS[preset_name(preset)]
-    arm = not (has_free_root(body_name) if free_root is None else free_root)
-    num_samples = num_samples or (row.samples_arm if arm else row.samples_body)
-    num_modes = num_modes or (row.modes_arm if arm else row.modes_body)
-    many = isinstance(motion, tuple)
-    noise = tuple(row.noise * m for m in motion) if many else row.noise * motion
-    dynamics = ConstantVelocity(deviation=noise, persistence=row.persistence)
-    if row.particles is not None:
-        return replace(
-            row.particles, num_samples=num_samples, num_modes=num_modes, dynamics=dynamics
-        )
-    proposal = (row.proposal_arm if arm else None) or row.proposal
-    assert proposal is not None
-    if isinstance(proposal, EigenDirectionGrid):
-        return GridTracker(
-            pattern=proposal,
-            num_samples=num_samples,
-            num_modes=num_modes,
-            optimiser=row.optimiser,
-        )
-    power = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
-    # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
-    if isinstance(proposal, (ChamRehg, Condensation)):
-        proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
-    return Tracker(
-        proposal=proposal,
-        num_samples=num_samples,
-        num_modes=num_modes,
-        optimiser=row.optimiser,
-        coarse_every=row.coarse_every,
-        converged_only=row.converged_only,
-        capped=row.capped,
-        keep_alike=row.keep_alike,
-        likelihood_power=power,
-        survivors=row.survivors_arm if arm else row.survivors_body,
-        dynamics=dynamics,
-        separation=row.separation,
-        soft_matching=row.soft_matching,
-        surprise=math.inf if arm else row.surprise_body,
-    )

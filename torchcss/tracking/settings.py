@@ -1,7 +1,7 @@
 """How to track, as one record of choices, and what it makes: features, cost and tracker.
 
 `Settings` is what the command line shows and `summary.json` holds. `make_extractor`, `make_choice`
-and `make_settings_tracker` turn it into the three objects that `torchcss.tracking.session` takes.
+and `make_tracker` turn it into the three objects that `torchcss.tracking.session` takes.
 """
 
 from __future__ import annotations
@@ -28,13 +28,16 @@ from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine
 from torchcss.errors import ConfigurationError, check_device
+from torchcss.inference.dynamics import ConstantVelocity, Deviation
+from torchcss.inference.grid_tracker import GridTracker
+from torchcss.inference.proposals import ChamRehg, Condensation, EigenDirectionGrid
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.initialise.view import CameraView
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.tracking.presets import PRESETS, Preset, make_tracker, preset_name
+from torchcss.tracking.presets import PRESETS, Preset, preset_name
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import Observer
-from torchcss.types import Bounds, Curvature, Vector, frozen
+from torchcss.types import Bounds, Curvature, frozen
 from torchcss.vision.edges import EdgeConfiguration
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING_FLOW
@@ -464,32 +467,57 @@ def _printed(
     )
 
 
-def make_settings_tracker(
-    settings: Settings, motion: Vector, free_root: bool | None = None
+def make_tracker(
+    settings: Settings, motion: Deviation = 0.0, free_root: bool | None = None
 ) -> SequenceTracker:
-    """The tracker that the settings ask for.
+    """The tracker that the settings ask for: the row of the table with their numbers.
 
     Args:
-        settings: Preset and numbers.
+        settings: Preset and numbers; arms and bodies differ in the preset's.
         motion: Standard deviation of every parameter's motion per frame.
         free_root: Whether the body moves about; None: told by its name.
-
-    Raises:
-        ConfigurationError: If there is no such preset.
     """
-    tracker = make_tracker(
-        settings.preset,
-        settings.body,
-        num_samples=settings.samples,
-        num_modes=settings.modes,
-        motion=tuple(motion.tolist()),
-        free_root=free_root,
+    row = PRESETS[settings.preset]
+    arm = not (has_free_root(settings.body) if free_root is None else free_root)
+    num_samples = settings.samples or (row.samples_arm if arm else row.samples_body)
+    num_modes = settings.modes or (row.modes_arm if arm else row.modes_body)
+    many = isinstance(motion, tuple)
+    noise = tuple(row.noise * m for m in motion) if many else row.noise * motion
+    dynamics = ConstantVelocity(deviation=noise, persistence=row.persistence)
+    if row.particles is not None:
+        return replace(
+            row.particles, num_samples=num_samples, num_modes=num_modes, dynamics=dynamics
+        )
+    proposal = (row.proposal_arm if arm else None) or row.proposal
+    assert proposal is not None
+    if isinstance(proposal, EigenDirectionGrid):
+        return GridTracker(
+            pattern=proposal,
+            num_samples=num_samples,
+            num_modes=num_modes,
+            optimiser=row.optimiser,
+        )
+    power = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
+    # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
+    if isinstance(proposal, (ChamRehg, Condensation)):
+        proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
+    return Tracker(
+        proposal=proposal,
+        num_samples=num_samples,
+        num_modes=num_modes,
+        optimiser=row.optimiser,
+        coarse_every=row.coarse_every,
+        converged_only=row.converged_only,
+        capped=row.capped,
+        keep_alike=row.keep_alike,
+        likelihood_power=settings.likelihood_power or power,
+        oversampling=settings.oversampling,
+        survivors=row.survivors_arm if arm else row.survivors_body,
+        dynamics=dynamics,
+        separation=row.separation,
+        soft_matching=row.soft_matching,
+        surprise=math.inf if arm else row.surprise_body,
     )
-    if not isinstance(tracker, Tracker):
-        return tracker  # `Settings` has refused what follows
-    if settings.likelihood_power is not None:
-        tracker = replace(tracker, likelihood_power=settings.likelihood_power)
-    return replace(tracker, oversampling=settings.oversampling)
 
 
 def make_engine(settings: Settings) -> Engine | None:
@@ -569,11 +597,11 @@ def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_inter
         frame_interval: Seconds between frames.
     """
     extractor, row = make_extractor(settings), PRESETS[settings.preset]
-    noise = _working_noise(extractor, view)
+    noise, motion = _working_noise(extractor, view), body.motion_rate * frame_interval
     return Plan(
         extractor=extractor,
         choice=make_choice(settings, noise, has_root(body)),
-        tracker=make_settings_tracker(settings, body.motion_rate * frame_interval, has_root(body)),
+        tracker=make_tracker(settings, tuple(motion.tolist()), has_root(body)),
         bounds=row.bounds(body.bounds),
         one_fit=row.start == "one fit",
         keypoints_first_only=settings.keypoints_first_only,
