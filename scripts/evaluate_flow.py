@@ -173,7 +173,7 @@ def errors(flow: Tensor, pair: Pair, near: Tensor) -> dict[str, float | None]:
 
 
 def boundary_score(result: OpticalFlow, true: Tensor, tolerance: int) -> dict[str, float | None]:
-    found = motion_boundaries(result).strength > 0.5
+    found = motion_boundaries(result) < 0.5
     hits, caught = found & with_margin(true, tolerance), true & with_margin(found, tolerance)
     return {
         "precision": float(hits.sum() / found.sum()) if found.any() else None,

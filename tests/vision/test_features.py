@@ -176,7 +176,7 @@ def test_features_of_motion(generator: torch.Generator) -> None:
     assert features.motion_boundary is not None
     expected = robust_flow(before, after, TRACKING_FLOW)
     assert torch.equal(features.flow, expected.flow)
-    assert torch.equal(features.motion_boundary, motion_boundaries(expected).potential)
+    assert torch.equal(features.motion_boundary, motion_boundaries(expected))
     assert (features.flow_outlier >= expected.data_outlier - 1e-6).all()
     assert (features.flow_outlier >= 0.5 * expected.smoothness_outlier - 1e-6).all()
     inside = torch.nn.functional.avg_pool2d(mask[None], 9, stride=1, padding=4)[0] == 1.0

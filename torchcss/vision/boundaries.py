@@ -14,7 +14,7 @@ are `displaced` along the flow first.
 
 The sign deserves a word: with W = 1 - k S_p the text wants k = 1 to exclude every edge that is
 *not* on a motion boundary, so S_p is low on boundaries and 1 elsewhere, a potential with the
-boundaries as its valleys. `MotionBoundaries` holds both, under names that cannot be mistaken.
+boundaries as its valleys.
 
 Only the smoothness term enters. The data term's outliers are occluded strips beside a boundary,
 but also glints and aliasing: on the two Middlebury pairs of the tests, adding them lowered the
@@ -27,7 +27,6 @@ By default: `motion_boundaries(flow)`.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -45,22 +44,10 @@ _LEAST_OUTLIER = 1e-3
 """What is less of an outlier is none."""
 
 
-class MotionBoundaries(NamedTuple):
-    """Motion boundaries as a smooth field.
-
-    Attributes:
-        strength: Near 1 on motion boundaries, 0 where the flow is smooth.
-        potential: S_p of section 3.1.2 [IJRR], one minus the strength.
-    """
-
-    strength: Images
-    potential: Images
-
-
 def motion_boundaries(
     flow: OpticalFlow, *, smoothing: float = 1.5, half_strength_line: float = 0.5
-) -> MotionBoundaries:
-    """Turn the outlier map of the smoothness term into motion boundaries of the second frame.
+) -> Images:
+    """Turn the outlier map of the smoothness term into the potential S_p of the second frame.
 
     Args:
         flow: What `robust_flow` returns. A flow under quadratic potentials has no outliers, so
@@ -85,8 +72,7 @@ def motion_boundaries(
     outlier = displaced(outlier, flow.flow, reach=math.ceil(2 * smoothing))
     blurred = gaussian_blur(outlier, smoothing)
     squared = (math.sqrt(0.5 * math.pi) * smoothing * blurred).square()
-    strength = squared / (squared + half_strength_line**2)
-    return MotionBoundaries(strength, 1.0 - strength)
+    return 1.0 - squared / (squared + half_strength_line**2)
 
 
 def displaced(outlier: Images, flow: Float[Tensor, "*batch 2 h w"], *, reach: int) -> Images:

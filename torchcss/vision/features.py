@@ -287,7 +287,7 @@ class FeatureExtractor(nn.Module):
             if float(flow.data_outlier.mean()) < _CUT_SHARE:
                 doubt = _DISCONTINUITY_DOUBT * flow.smoothness_outlier
                 held = (1.0 - flow.data_outlier) * (1.0 - doubt)
-                boundary = motion_boundaries(flow).potential
+                boundary = motion_boundaries(flow)
                 return features._replace(
                     flow=_within(window, grey, flow.flow, 0.0),
                     flow_outlier=_within(window, grey, 1.0 - held, 1.0),
