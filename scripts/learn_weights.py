@@ -32,7 +32,7 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.cli.options import SettingsOptions
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import NOTHING_KNOWN, FrameCosts, Learnt
 from torchcss.errors import ConfigurationError
 from torchcss.inference.implicit import TermWeights, weighted_minimum
 from torchcss.inference.mixture import GaussianMixture, Prior
@@ -52,7 +52,6 @@ from torchcss.tracking.settings import (
     make_extractor,
 )
 from torchcss.types import Frame
-from torchcss.vision.appearance import Appearance
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
@@ -199,17 +198,12 @@ class Lesson:
         )  # fmt: skip
         self.joints = body.pose(truth.states).joints
         self.features: list[FrameFeatures] = []
-        self.appearance: list[Appearance | None] = [None]
+        self.known: list[Learnt] = [NOTHING_KNOWN]
         last = None
         for index, image in enumerate(tqdm(truth.images, unit="frame", desc="features")):
             self.features.append(extractor(image, last))
-            learnt = self.costs.learn(
-                self.appearance[-1],
-                self.features[-1],
-                body,
-                truth.states[index],
-            )
-            self.appearance.append(learnt)
+            pose = truth.states[index : index + 1]
+            self.known.append(self.costs.learn(self.known[-1], self.features[-1], body, pose))
             last = image
 
     def errors(
@@ -235,7 +229,7 @@ class Lesson:
             like = torch.eye(len(deviation)).to(x).expand(len(x), -1, -1)
             prior = Prior.of(GaussianMixture(start, like, x.new_zeros(len(x))))
             cost = self.costs(
-                self.features[index], body=body, before=x, appearance=self.appearance[index]
+                self.features[index], body=body, before=x, known=self.known[index]
             ).of_children(torch.arange(len(x)), prior)
             new = weighted_minimum(cost, weights, start, body.bounds, optimiser=OPTIMISER)
             away = body.pose(new).joints - self.joints[index]

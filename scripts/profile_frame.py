@@ -28,6 +28,7 @@ from common import Table, start, write_report
 
 from torchcss.app.track import track_video
 from torchcss.cli.options import SettingsOptions
+from torchcss.cost.frame import FrameCosts
 from torchcss.cost.fused.engine import FusedEngine
 from torchcss.inference import tracker
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -35,7 +36,6 @@ from torchcss.kernels import checked
 from torchcss.tracking.flip_moves import Flips
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.tracking.view import Observer
 from torchcss.vision import features
 
 STAGES: dict[str, tuple[Any, str]] = {
@@ -49,7 +49,7 @@ STAGES: dict[str, tuple[Any, str]] = {
     "flips of limbs": (Flips, "states"),
     "the rest of the search": (tracker.Tracker, "step"),
     "the best mode's terms": (TrackingSession, "_terms_of_best"),
-    "learning colours": (Observer, "learn"),
+    "learning colours": (FrameCosts, "learn"),
     "the rest": (TrackingSession, "step"),
 }
 """Functions that are timed, by the name of their stage; the last one ends a frame."""

@@ -16,7 +16,7 @@ from torchcss.body.model import BodyModel
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.flow import FlowTerm
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import NOTHING_KNOWN, FrameCosts
 from torchcss.cost.part_map import bare_pixels, part_map
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationImages, SegmentationTerm
@@ -26,7 +26,7 @@ from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import CovarianceScaled
 from torchcss.inference.tracker import Tracker
 from torchcss.initialise.view import CameraView
-from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, Observer
+from torchcss.tracking.view import NOTHING_SEEN, Observer
 from torchcss.types import Bounds, Frame, LocalModel
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor, Window
@@ -156,14 +156,14 @@ def test_what_a_frame_taught_weighs_the_poses_of_the_next() -> None:
     costs = FrameCosts(body, camera, choice)
     unknown = costs(features, body=body, before=truth[None])
     assert not unknown.weighs
-    appearance = costs.learn(None, features, body, truth)
-    cost = costs(features, body=body, before=truth[None], appearance=appearance)
+    known = costs.learn(NOTHING_KNOWN, features, body, truth[None])
+    cost = costs(features, body=body, before=truth[None], known=known)
     right, wrong = cost.weight_only(torch.stack([truth, hidden])).tolist()
     assert 0 < right < 0.4 * SegmentationTerm().weight
     assert right < wrong - 0.05 * SegmentationTerm().weight
     # A frame without a frame before it has no unit of area, and one without a picture says nothing.
-    assert not costs(features, body=body, appearance=appearance).weighs
-    assert not costs(None, body=body, before=truth[None], appearance=appearance).weighs
+    assert not costs(features, body=body, known=known).weighs
+    assert not costs(None, body=body, before=truth[None], known=known).weighs
 
 
 def before_a_wall(body: BodyModel, camera: Camera, state: Tensor) -> np.ndarray:
@@ -194,7 +194,8 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
         for index in range(2):
             frame = Frame(index, 0.0, before_a_wall(body, camera, before))
             seen = observer.observe(frame, seen)
-            memory = observer.learn(observer.recall(memory, seen), seen, body, before[None])
+            memory = observer.recall(memory, seen)
+            memory = costs.learn(memory, seen.features, body, before[None])
         seen = observer.observe(Frame(2, 0.0, before_a_wall(body, camera, after)), seen)
         memory = observer.recall(memory, seen)
         assert (memory.background is not None) == asked
@@ -211,7 +212,7 @@ def test_a_camera_that_stands_still_knows_what_was_behind(dtype: torch.dtype) ->
     assert gaps[True] > gaps[False] + 20
     # A cut, and a picture that is missing.
     seen = observer.observe(None, seen)
-    memory = observer.learn(memory, seen, body, before[None])
+    memory = costs.learn(memory, seen.features, body, before[None])
     assert memory.background is not None
     seen = observer.observe(Frame(3, 0.0, 255 - before_a_wall(body, camera, after)), seen)
     assert observer.recall(memory, seen).background is None
@@ -251,9 +252,9 @@ def test_a_body_without_flesh_shows_nothing(tmp_path: Path, dtype: torch.dtype) 
     features = FeatureExtractor(colour=True, flow=TRACKING_FLOW)(noise, noise)
     choice = CostChoice().having(RegionTerm(), SegmentationTerm(), FlowTerm())
     costs = FrameCosts(body, camera, choice)
-    appearance = costs.learn(None, features, body, x[0, 0])
-    assert appearance is None
-    cost = costs(features, body=body, before=x[0, :1], appearance=appearance)
+    known = costs.learn(NOTHING_KNOWN, features, body, x[0, :1])
+    assert known == NOTHING_KNOWN
+    cost = costs(features, body=body, before=x[0, :1], known=known)
     for part in (cost.value(x), cost.weight_only(x), *cost.local_model(x)):
         assert part.dtype == dtype
         assert not part.any()

@@ -18,7 +18,7 @@ from torchcss.body.surface import surface_points
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.contour import ContourTerm
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import NOTHING_KNOWN, FrameCosts
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.shaped import Outline, ShapedCost
@@ -86,8 +86,8 @@ def problem(thicker: float, by: str) -> tuple[ShapedCost, torch.Tensor, ShapePar
     else:
         term = RegionTerm()
         costs = FrameCosts(body, camera, CostChoice(terms=(term,)))
-        known = costs.learn(None, features, body, x, fitted=False)
-        cost = costs(features, body=body, appearance=known)
+        known = costs.learn(NOTHING_KNOWN, features, body, x[None], fitted=False)
+        cost = costs(features, body=body, known=known)
         outline = Outline(term, cost.bound[term, cost.views[0]].image, 400.0)
     cost = ShapedCost(base=base, parameters=parameters, outlines=(outline,))
     return cost, torch.cat([x, torch.zeros_like(z)]), parameters

@@ -16,7 +16,7 @@ from torch.func import hessian, jacrev, vmap
 from torchcss.body.model import BodyModel
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import NOTHING_KNOWN, FrameCosts, Learnt
 from torchcss.cost.interior import InteriorNodes
 from torchcss.cost.part_map import part_map
 from torchcss.cost.silhouette import SilhouetteImages, SilhouetteTerm
@@ -251,7 +251,7 @@ def test_a_frame_needs_a_background_or_a_mask_and_a_pose_before() -> None:
     seen = seen.learn(features.colour, inside, ~inside)
     wall = torch.full_like(features.colour, 40 / 255)
     known = Background.unknown(wall).learn(wall, torch.ones_like(drawn))
-    args = {"body": body, "before": truth[None], "appearance": seen, "background": known}
+    args = {"body": body, "before": truth[None], "known": Learnt(seen, known)}
 
     def found(costs: FrameCosts, features: FrameFeatures | None, **args: Any) -> Any:
         cost = costs(features, **args)
@@ -261,8 +261,11 @@ def test_a_frame_needs_a_background_or_a_mask_and_a_pose_before() -> None:
     assert len(images.points) > 50
     value = SilhouetteTerm().value(nodes(body, truth), images.camera, images).sum()
     assert float(value) < 0.1
-    for missing in ("before", "appearance", "background"):
-        assert found(costs, features, **{**args, missing: None}) is None
+    for missing in (
+        *({"before": None}, {"known": NOTHING_KNOWN}),
+        *({"known": Learnt(seen)}, {"known": Learnt(background=known)}),
+    ):
+        assert found(costs, features, **{**args, **missing}) is None
     assert found(costs, None, **args) is None
     masked = extract(before.numpy(), mask=drawn.numpy())
     images = found(costs, masked, body=body, before=truth[None]).image

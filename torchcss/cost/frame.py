@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from copy import copy
+from typing import NamedTuple
 
 from jaxtyping import Float
 from torch import Tensor
@@ -33,6 +34,21 @@ from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
+
+
+class Learnt(NamedTuple):
+    """What one camera has taught.
+
+    Attributes:
+        appearance: What body and surroundings look like; None: not known.
+        background: What is behind the body; None: not known, or not asked for.
+    """
+
+    appearance: Appearance | None = None
+    background: Background | None = None
+
+
+NOTHING_KNOWN = Learnt()
 
 
 class FrameCosts:
@@ -84,8 +100,7 @@ class FrameCosts:
         body: BodyModel,
         before: Float[Tensor, "k n"] | None = None,
         keypoints: Keypoints | None = None,
-        appearance: Appearance | None = None,
-        background: Background | None = None,
+        known: Learnt = NOTHING_KNOWN,
         stopwatch: Stopwatch | None = None,
     ) -> TrackingCost:
         """The cost of a frame.
@@ -95,8 +110,7 @@ class FrameCosts:
             body: The body on this frame's base.
             before: The modes of the frame before, which the flow carries on; None: no flow.
             keypoints: Keypoints of the frame, in pixels of the features.
-            appearance: What the body and its surroundings look like, see `learn`; None: not known.
-            background: What is behind the body, see `learn_background`; None: not known.
+            known: What was learnt from the frames before, see `learn`.
             stopwatch: Where the time of evaluations is added up.
         """
         context = FrameContext(
@@ -109,8 +123,8 @@ class FrameCosts:
             else features.edge_field(boundary_emphasis=self.boundary_emphasis).to(body.tie),
             boundary_emphasis=self.boundary_emphasis,
             keypoints=keypoints,
-            appearance=appearance,
-            background=background,
+            appearance=known.appearance,
+            background=known.background,
             modes=None if before is None else before.reshape(-1, before.shape[-1]),
             deviation=self.deviation,
         )
@@ -120,57 +134,36 @@ class FrameCosts:
 
     def learn(
         self,
-        appearance: Appearance | None,
-        features: FrameFeatures | None,
-        body: BodyModel,
-        state: Float[Tensor, " n"],
-        *,
-        fitted: bool = True,
-    ) -> Appearance | None:
-        """Take in what body and surroundings look like in a frame.
-
-        None without a term that asks for it, and of a body without parts.
-
-        Args:
-            appearance: What was known before; None: nothing.
-            features: Features of the frame, with colours.
-            body: The body on this frame's base.
-            state: Its pose.
-            fitted: Whether its girths are the person's, see `region_masks`.
-        """
-        if "appearance" not in self.choice.needs or body.num_parts == 0:
-            return None
-        if features is None or features.colour is None:
-            return appearance
-        if appearance is None:
-            appearance = Appearance.unknown(self.num_layers, like=features.colour)
-        masks = region_masks(body, state, self.camera, fitted=fitted)
-        return appearance.learn(features.colour[masks.pixels], masks.inside, masks.outside)
-
-    def learn_background(
-        self,
-        background: Background | None,
+        known: Learnt,
         features: FrameFeatures | None,
         body: BodyModel,
         modes: Float[Tensor, "k n"],
-        log_weight: Float[Tensor, " k"],
-    ) -> Background | None:
-        """Take in what a frame shows where the body is not.
+        log_weight: Float[Tensor, " k"] | None = None,
+        *,
+        fitted: bool = True,
+    ) -> Learnt:
+        """Take in what body, surroundings and background look like in a frame.
 
-        None where the choice does not ask for it.
+        What no term asks for, and what a body without parts looks like, is not learnt.
 
         Args:
-            background: What was known before; None: nothing.
+            known: What was known before.
             features: Features of the frame, with colours.
             body: The body on this frame's base.
-            modes: Poses that it may have.
-            log_weight: Their weights.
+            modes: Poses that it may have, the best first.
+            log_weight: Their weights; None: all the same.
+            fitted: Whether its girths are the person's, see `region_masks`.
         """
-        if not self.choice.whole_picture or body.num_parts == 0:
-            return None
-        if features is None or features.colour is None:
-            return background
-        if background is None:
-            background = Background.unknown(features.colour)
-        bare = bare_pixels(body, modes, log_weight, self.camera)
-        return background.learn(features.colour, bare, features.flow)
+        if features is None or features.colour is None or body.num_parts == 0:
+            return known
+        (appearance, background), colour = known, features.colour
+        if "appearance" in self.choice.needs:
+            masks = region_masks(body, modes[0], self.camera, fitted=fitted)
+            appearance = appearance or Appearance.unknown(self.num_layers, like=colour)
+            appearance = appearance.learn(colour[masks.pixels], masks.inside, masks.outside)
+        if self.choice.whole_picture:
+            weight = modes.new_zeros(len(modes)) if log_weight is None else log_weight
+            bare = bare_pixels(body, modes, weight, self.camera)
+            background = background or Background.unknown(colour)
+            background = background.learn(colour, bare, features.flow)
+        return Learnt(appearance, background)

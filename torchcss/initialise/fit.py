@@ -28,7 +28,7 @@ from torchcss.body.root import has_root
 from torchcss.body.shape import WHOLE_SHAPE, ShapeParameters, with_shape
 from torchcss.body.surface import SHAPE_NAMES
 from torchcss.cost.contour import ContourTerm
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import NOTHING_KNOWN, FrameCosts
 from torchcss.cost.fused import threads_for
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.outline import OutlineTerm
@@ -270,12 +270,12 @@ def _contour_cost(
     outlines = beside if options.colours else (ContourTerm(),)
     choice = choice.having(replace(joints, sigma=factor * joints.sigma))
     choice = replace(choice, terms=(*outlines, *choice.terms))
-    costs = FrameCosts(first.body, working, choice, engine=options.evaluator)
+    costs, body = FrameCosts(first.body, working, choice, engine=options.evaluator), first.body
     return costs(
         features,
-        body=first.body,
+        body=body,
         keypoints=view.scaled(factor).keypoints,
-        appearance=costs.learn(None, features, first.body, first.mixture.mean[0], fitted=False),
+        known=costs.learn(NOTHING_KNOWN, features, body, first.mixture.mean, fitted=False),
     )
 
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.cost.context import FrameContext
+from torchcss.cost.frame import NOTHING_KNOWN
 from torchcss.cost.total import TrackingCost
 from torchcss.errors import ConfigurationError
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -42,7 +43,7 @@ from torchcss.studies.render.sequences import arm_sequence
 from torchcss.studies.sequences import RecordedSequence, read_reference
 from torchcss.studies.slices import StateLine, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
-from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN
+from torchcss.tracking.view import NOTHING_SEEN
 from torchcss.types import Bounds, Frame, Modes, Vector
 from torchcss.vision.features import FrameFeatures
 
@@ -215,8 +216,8 @@ def _scene(
     observer = make_plan(settings, body, view, now.time_s - before.time_s).observer(body, view)
     seen_before = observer.observe(before, NOTHING_SEEN)
     seen = observer.observe(now, seen_before)
-    memory = observer.learn(NOTHING_KNOWN, seen_before, body, previous[None])
-    cost = observer.cost(seen, memory, body, previous).of_mode(previous)
+    known = observer.costs.learn(NOTHING_KNOWN, seen_before.features, body, previous[None])
+    cost = observer.cost(seen, known, body, previous).of_mode(previous)
     mode = TrustRegionNewton().minimise(cost, truth[None], body.bounds)
     assert seen.features is not None
     return Scene(name, now.image, seen.features, cost, truth, mode.take(0))

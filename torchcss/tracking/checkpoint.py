@@ -17,12 +17,13 @@ import torch
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
+from torchcss.cost.frame import Learnt
 from torchcss.errors import TrackFileError
 from torchcss.inference.loss_monitor import MonitorState
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.tracker import Particles, TrackerState
 from torchcss.tracking.session import SessionState
-from torchcss.tracking.view import ViewMemory, ViewObservation
+from torchcss.tracking.view import ViewObservation
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.features import Window
@@ -98,9 +99,7 @@ def state_from_tensors(tensors: Mapping[str, Tensor], body: BodyModel) -> Sessio
                 )
             )
             appearance = _get(Appearance, tensors, f"{at}.appearance", like)
-            memory.append(
-                ViewMemory(appearance, _get(Background, tensors, f"{at}.background", like))
-            )
+            memory.append(Learnt(appearance, _get(Background, tensors, f"{at}.background", like)))
         return SessionState(
             tracker=tracker,
             body=body,

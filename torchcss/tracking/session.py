@@ -36,6 +36,7 @@ from torch import Tensor
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root, move_base, root_pose
 from torchcss.body.rotations import within_half_turn
+from torchcss.cost.frame import NOTHING_KNOWN, Learnt
 from torchcss.cost.fused import threads_for
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost, beside
@@ -59,10 +60,8 @@ from torchcss.tracking.limb_moves import LostLimbs
 from torchcss.tracking.settings import Plan, Settings, make_plan
 from torchcss.tracking.surface_prediction import PicturePair, SurfaceDynamics, SurfaceMotion
 from torchcss.tracking.view import (
-    NOTHING_KNOWN,
     NOTHING_SEEN,
     Observer,
-    ViewMemory,
     ViewObservation,
 )
 from torchcss.types import TIME_ROUNDING, Bounds, Frame, Vectors
@@ -160,7 +159,7 @@ class SessionState(NamedTuple):
     tracker: TrackerState
     body: BodyModel
     seen: tuple[ViewObservation, ...]
-    memory: tuple[ViewMemory, ...]
+    memory: tuple[Learnt, ...]
     monitor: MonitorState | None
     num_lost: int = 0
     windows: tuple[ViewWindows, ...] = ()
@@ -418,7 +417,7 @@ class TrackingSession:
         windows: ViewWindows = (None,) * len(self._observers)
         if not lost:
             memory = tuple(
-                observer.learn(known, seen, body, modes.mean, modes.log_weight)
+                observer.costs.learn(known, seen.features, body, modes.mean, modes.log_weight)
                 for observer, known, seen in self._of_views(memory, observation)
             )
             windows = self._windows(body, modes)
@@ -465,14 +464,14 @@ class TrackingSession:
         return recovery.monitor.update(monitor, {n: cost for n, cost in per_view if n in watched})
 
     def _of_views(
-        self, memory: Sequence[ViewMemory], observation: Observation
-    ) -> Iterator[tuple[Observer, ViewMemory, ViewObservation]]:
+        self, memory: Sequence[Learnt], observation: Observation
+    ) -> Iterator[tuple[Observer, Learnt, ViewObservation]]:
         return zip(self._observers, memory, observation.views, strict=True)
 
     def _cost(
         self,
         observation: Observation,
-        memory: Sequence[ViewMemory],
+        memory: Sequence[Learnt],
         stopwatch: Stopwatch,
         intervals: float,
     ) -> TrackingCost:

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import free_turns
+from torchcss.cost.frame import NOTHING_KNOWN
 from torchcss.cost.total import TrackingCost, beside
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.inference.smoothing import IN_WINDOWS, Refined, refine_in_windows
@@ -36,7 +37,7 @@ from torchcss.tracking.smooth import (
     motion_prior,
     smooth_modes,
 )
-from torchcss.tracking.view import NOTHING_KNOWN, NOTHING_SEEN, Observer
+from torchcss.tracking.view import NOTHING_SEEN, Observer
 from torchcss.types import Frame, Trajectory
 
 IMAGES = Smoothing(acceleration_ratio=20.0)
@@ -157,5 +158,5 @@ def _costs(
             ]
         )
         own = start[row : row + 1]
-        memory = [observer.learn(past, now, there, own) for observer, now, past in known]
+        memory = [each.costs.learn(past, now.features, there, own) for each, now, past in known]
         before = changes[row](own) if row in changes else own

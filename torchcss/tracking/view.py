@@ -18,13 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcss.body.model import BodyModel
-from torchcss.cost.frame import FrameCosts
+from torchcss.cost.frame import FrameCosts, Learnt
 from torchcss.cost.total import TrackingCost
 from torchcss.initialise.view import CameraView
 from torchcss.stopwatch import Stopwatch
-from torchcss.types import Frame, Keypoints, Numbers, Vectors, frozen
-from torchcss.vision.appearance import Appearance
-from torchcss.vision.background import Background
+from torchcss.types import Frame, Keypoints, Vectors, frozen
 from torchcss.vision.contrast import local_contrast
 from torchcss.vision.features import FeatureExtractor, FrameFeatures, Window
 from torchcss.vision.spline import SplineField, spline_field
@@ -48,18 +46,6 @@ class ViewObservation(NamedTuple):
     contrast_before: SplineField | None = None
 
 
-class ViewMemory(NamedTuple):
-    """What one camera has taught.
-
-    Attributes:
-        appearance: What body and surroundings look like; None: not known.
-        background: What is behind the body; None: not known, or not asked for.
-    """
-
-    appearance: Appearance | None = None
-    background: Background | None = None
-
-
 _RINGS, _MERIDIANS = 5, 8
 """Of the mesh by which it is found where a body can be."""
 
@@ -74,7 +60,6 @@ _FEW = 64
 """Of so many rows one tells that a picture is not of one colour, as a rule."""
 
 NOTHING_SEEN = ViewObservation(None)
-NOTHING_KNOWN = ViewMemory()
 
 
 @frozen
@@ -150,17 +135,17 @@ class Observer:
             return None
         return Window(left, top, right, bottom, int(motion / 2))
 
-    def recall(self, memory: ViewMemory, seen: ViewObservation) -> ViewMemory:
+    def recall(self, known: Learnt, seen: ViewObservation) -> Learnt:
         """What is known still holds for a frame: the background of another scene does not."""
         colour = None if seen.features is None else seen.features.colour
-        if memory.background is None or colour is None or memory.background.holds(colour):
-            return memory
-        return memory._replace(background=None)
+        if known.background is None or colour is None or known.background.holds(colour):
+            return known
+        return known._replace(background=None)
 
     def cost(
         self,
         seen: ViewObservation,
-        memory: ViewMemory,
+        known: Learnt,
         body: BodyModel,
         before: Vectors | None,
         *,
@@ -171,7 +156,7 @@ class Observer:
 
         Args:
             seen: What is seen of it.
-            memory: What is known.
+            known: What was learnt from the frames before.
             body: The body on this frame's base.
             before: The modes of the frame before; None: no flow.
             keypoints: Whether keypoints count in this frame.
@@ -182,32 +167,8 @@ class Observer:
             body=body,
             before=before,
             keypoints=self.keypoints_of(seen.frame, body) if keypoints else None,
-            appearance=memory.appearance,
-            background=memory.background,
+            known=known,
             stopwatch=stopwatch,
-        )
-
-    def learn(
-        self,
-        memory: ViewMemory,
-        seen: ViewObservation,
-        body: BodyModel,
-        modes: Vectors,
-        log_weight: Numbers | None = None,
-    ) -> ViewMemory:
-        """Take in what body, surroundings and background look like in a frame.
-
-        Args:
-            memory: What was known.
-            seen: What is seen of the frame.
-            body: The body on this frame's base.
-            modes: Poses that it may have, the best first.
-            log_weight: Their weights; None: all the same.
-        """
-        weight = modes.new_zeros(len(modes)) if log_weight is None else log_weight
-        return ViewMemory(
-            self.costs.learn(memory.appearance, seen.features, body, modes[0]),
-            self.costs.learn_background(memory.background, seen.features, body, modes, weight),
         )
 
     def keypoints_of(self, frame: Frame | None, body: BodyModel) -> Keypoints | None:
