@@ -52,14 +52,14 @@ def plain_twin(term: SilhouetteTerm, points: Tensor, images: SilhouetteImages) -
         phi = math.log((1 + term.epsilon) / (1 + term.epsilon - math.exp(-covered))) / full
         total += float(weight) * phi
     out = images.bare.value(uv) * valid
-    return term.nu * (total + term.beta * float(out.mean()))
+    return total + term.beta * float(out.mean())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("batch", [(), (2,), (2, 1), (0,)])
 def test_it_is_the_sum_over_points_and_nodes(batch: tuple[int, ...], dtype: torch.dtype) -> None:
     body, camera = a_body_before_a_camera(dtype)
-    term = SilhouetteTerm(spacing=1.5, nu=2.0)
+    term = SilhouetteTerm(spacing=1.5)
     images = the_silhouette_of(body, camera, moved(body, 0.9), body.rest, term)
     assert len(images.points) > 20
     generator = torch.Generator().manual_seed(0)

@@ -256,7 +256,6 @@ def test_gaussian_refinement_is_the_bounded_least_squares(
         times,
         Transition(velocity=velocity, acceleration=acceleration),
         interval(n, *limits),
-        choice=Refinement(prior_variance=torch.full((n,), 1e12).double()),
     )
     matrix, right = dense(evidence, times, velocity, acceleration)
     exact = plain.bounded(matrix, right, *(np.full(t * n, limit) for limit in limits))
@@ -270,11 +269,13 @@ def test_gaussian_refinement_is_the_bounded_least_squares(
         assert bool(found.active.any())
 
     free = ~found.active.flatten().numpy()
+    prior = 1.0 if limits == UNBOUNDED else ((limits[1] - limits[0]) / 4) ** 2
+    told = matrix.T @ matrix + np.eye(t * n) / prior
     inverse = np.zeros((t * n, t * n))
-    inverse[np.ix_(free, free)] = np.linalg.inv((matrix.T @ matrix)[np.ix_(free, free)])
+    inverse[np.ix_(free, free)] = np.linalg.inv(told[np.ix_(free, free)])
     for frame in range(t):
         rows = slice(frame * n, (frame + 1) * n)
-        expected = inverse[rows, rows] + np.diag(np.where(free[rows], 0.0, 1e12))
+        expected = inverse[rows, rows] + np.diag(np.where(free[rows], 0.0, prior))
         assert found.covariance[frame].numpy() == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 

@@ -73,7 +73,7 @@ class SilhouetteTerm(Term):
     """The disagreement of the body with the silhouette. Lengths are for a person.
 
     Attributes:
-        weight: Nats per nu, for a body of which nothing is covered.
+        weight: Nats, for a body of which nothing is covered.
         sigma: How far from a node a point is covered, metres at the body's distance: of who is seen
             close the nodes are farther apart. Points feel nodes within three times as much.
         epsilon: The least that a point counts as covered.
@@ -84,7 +84,6 @@ class SilhouetteTerm(Term):
         least: Ratio from which a pixel is of the silhouette; it is bare below.
         reduction: Pixels of the image, along each side, to one that is looked at.
         spacing: Distance of the points, as a share of sigma.
-        nu: Level of the cost (its unit only).
     """
 
     name = "silhouette"
@@ -99,7 +98,6 @@ class SilhouetteTerm(Term):
     least: float = 0.3
     reduction: int = 4
     spacing: float = 0.5
-    nu: float = 1.0
 
     @property
     def needs(self) -> frozenset[Need]:
@@ -143,7 +141,7 @@ class SilhouetteTerm(Term):
             image=images,
             camera=images.camera,
             link=nodes.node_link,
-            scale=self.weight / self.nu,
+            scale=self.weight,
             size=math.ceil(nodes.num_nodes * len(images.points) / _PAIRS),
         )
 
@@ -183,7 +181,7 @@ class SilhouetteTerm(Term):
     def value(
         self, points: Points, camera: Camera, images: SilhouetteImages, at: Points | None = None
     ) -> Values:
-        """Cost in units of nu, shared out among the nodes: only the sum has a meaning.
+        """Cost, shared out among the nodes: only the sum has a meaning.
 
         Args:
             points: Nodes of the posed body, metres.
@@ -229,7 +227,7 @@ class SilhouetteTerm(Term):
         return camera.pull_back(model, value, gradient, hessian, gauss_newton=gauss_newton)
 
     def _outside(self, points: Tensor) -> Tensor:
-        return points.new_tensor(self.nu * self.beta / max(points.shape[-2], 1))
+        return points.new_tensor(self.beta / max(points.shape[-2], 1))
 
     def _cover(
         self, uv: Tensor, valid: Tensor, images: SilhouetteImages
@@ -246,7 +244,7 @@ class SilhouetteTerm(Term):
         share = (level + 2 * node @ target.mT).clamp(max=0).exp()
         missed = (-share.sum(-2)).exp()
         left = 1 + self.epsilon - missed
-        unit = self.nu * images.weight / math.log((1 + self.epsilon) / self.epsilon)
+        unit = images.weight / math.log((1 + self.epsilon) / self.epsilon)
         covered = (unit * ((1 + self.epsilon) / left).log()).sum(-1)
         slope = unit * missed / left / images.sigma**2
         return share, covered, slope

@@ -263,16 +263,11 @@ class Refinement:
 
     Attributes:
         likelihood_power: Factor on the costs.
-        prior_variance: Variance of each parameter before any image is seen: of variables that a
-            bound holds (decision: active bounds), and a weak prior on the others in the
-            covariances, not in the means. By default `default_prior_variance` of the least box that
-            holds those of all frames.
         max_steps: Iterations, each one evaluation of all frames.
         tolerance: Expected decrease of the sum, nats, below which it is done.
     """
 
     likelihood_power: float = 1.0
-    prior_variance: Vector | None = None
     max_steps: int = 50
     tolerance: float = 1e-6
 
@@ -526,10 +521,10 @@ def _refined(
     like: Tensor,
 ) -> Refined:
     """The result, in the type that came in."""
-    prior_variance = choice.prior_variance
-    if prior_variance is None:
-        # The box that holds those of all frames: a frame that is held says nothing of the others.
-        prior_variance = default_prior_variance(Bounds(limits.lower.amin(0), limits.upper.amax(0)))
+    # Of variables that a bound holds (decision: active bounds), and a weak prior on the others in
+    # the covariances, not in the means. The box is the one that holds those of all frames: a frame
+    # that is held says nothing of the others.
+    prior_variance = default_prior_variance(Bounds(limits.lower.amin(0), limits.upper.amax(0)))
     active = held_by(x, chain.gradient, limits)
     return Refined(
         mean=x.to(like),
