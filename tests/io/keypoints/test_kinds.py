@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -1407,6 +1408,8 @@ def test_arrays_of_several_cameras_are_told(tmp_path: Path) -> None:
         ([{"version": 0, "tags": [], "shapes": [], "tracks": []}], "CVAT's backup of a task"),
         ({"version": "2.0", "item": {}, "annotations": []}, "V7 Darwin's"),
         ({"bone_list": [], "frames": []}, "in space"),
+        ({"univTime": 1.0, "bodies": [{"joints19": [1.0] * 76}]}, "CMU Panoptic's joints in space"),
+        ({"annolist": [{"image": [{"name": "0.jpg"}]}]}, "as MPII and PoseTrack had them"),
         ([{"bodyparts": [], "bboxes": [], "bbox_scores": []}], "give the .h5 beside it"),
     ],
 )
@@ -2081,3 +2084,61 @@ def test_landmarks_in_a_result(tmp_path: Path) -> None:
              for joint in joints]  # fmt: skip
     frames = [{"frame": t, "result": {"pose_landmarks": [marks[t]]}} for t in T]
     check(read(write(tmp_path / "a.json", frames)))
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_people_by_number_above_their_frames(tmp_path: Path, first: int) -> None:
+    """AlphaPose's tracks as ShanghaiTech's clips have them; frames above people stay so."""
+    tracks = {"0": (person, T), "1": (other, [1, 2])}
+    people = {
+        who: {str(t + first): {"keypoints": of(t).ravel().tolist(), "scores": None} for t in frames}
+        for who, (of, frames) in tracks.items()
+    }
+    check(read(write(tmp_path / "a.json", people)))
+    frames = {str(t): {"0": person(t).tolist(), "1": other(t).tolist()} for t in T}
+    check(read(write(tmp_path / "a.json", frames)))
+    check(
+        read(write(tmp_path / "a.json", {str(t): dict(enumerate(frames[str(t)]["0"])) for t in T}))
+    )
+
+
+@pytest.mark.parametrize("form", ["rows", "columns", "some missing"])
+def test_frames_of_every_joint(tmp_path: Path, form: str) -> None:
+    rows = np.stack([person(t) for t in T], axis=1).tolist()
+    content: dict[str, Any] = dict(zip(TFJS, rows, strict=True))
+    if form == "columns":
+        content = {
+            name: dict(zip(("x", "y", "score"), np.transpose(own).tolist(), strict=True))
+            for name, own in content.items()
+        }
+    elif form == "some missing":
+        content = {name: [each if t != 3 else None for t, each in enumerate(own)]
+                   for name, own in content.items()}  # fmt: skip
+    check(read(write(tmp_path / "a.json", content)), (3,) if form == "some missing" else ())
+    one = {name: own[0] for name, own in zip(TFJS, rows, strict=True)}
+    found = read(write(tmp_path / "b.json", one), num_frames=1)
+    np.testing.assert_array_equal(found.positions[0], person(0)[:, :2])
+
+
+def test_names_of_ml_kit(tmp_path: Path) -> None:
+    names = [re.sub("_(.)", lambda each: each[1].upper(), re.sub("(mouth)_(.*)", r"\2_\1", name))
+             for name in MEDIAPIPE_NAMES]  # fmt: skip
+    frames = [{"frame": t, "landmarks": {
+        f"PoseLandmarkType.{name}": {"x": x, "y": y, "z": -3.0, "likelihood": c}
+        for name, (x, y, c) in zip(names, person(t, ALIASES["MediaPipe-33"]), strict=True)
+    }} for t in T]  # fmt: skip
+    found = read(write(tmp_path / "a.json", frames))
+    check(found)
+    assert "layout: MediaPipe-33, as the file says" in found.report
+
+
+def test_points_of_openpose_in_a_long_table(tmp_path: Path) -> None:
+    """dfMaker's: `points` is the joint, of whatever part `type_points` says; pandas' index too."""
+    heads = ["x", "y", "c", "nx", "ny", "type_points", "people_id", "points", "id", "frame"]
+    rows = [[*joint, 0, 0, f"{part}_keypoints", 1, n, "clip", t]
+            for t in T for part in ("pose", "face")
+            for n, joint in enumerate(person(t, OPENPOSE))]  # fmt: skip
+    check(read(write(tmp_path / "a.csv", wide(heads, rows))))
+    above = [["joint", *np.repeat(TFJS, 3)], ["coord", *("x", "y", "conf") * 17], ["frame"]]
+    text = "\n".join(",".join(map(str, row)) for row in [*above, *([t, *flat(t)] for t in T)])
+    check(read(write(tmp_path / "b.csv", text)))

@@ -63,6 +63,7 @@ from torchcss.io.keypoints.words import (
     time_word,
 )
 from torchcss.io.video import natural_order
+from torchcss.joint_names import canonical_joint_name
 
 _FORMATS = {
     "pose_keypoints_2d": "OpenPose", "pose_keypoints": "OpenPose", "bodies": "AlphaPose",
@@ -82,6 +83,8 @@ _OTHERS = {
     "data_row projects": "Labelbox's; convert it to COCO",
     "bodyparts bboxes": "DeepLabCut's before it makes a table of it; give the .h5 beside it",
     "bone_list frames": "Azure Kinect's joints in space; expected pixels",
+    "univTime bodies": "CMU Panoptic's joints in space; expected pixels",
+    "annolist": "annotations as MPII and PoseTrack had them before COCO's; convert them to these",
 }
 """Files of other kinds by words in them, and what to do."""
 
@@ -250,12 +253,14 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
         inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
             return _frames(path, scored(inner, content), num_frames)
+        if (rows := _by_joint(content)) is not None:
+            return _frames(path, rows, num_frames)
         told = [each for each in content.values() if isinstance(each, list) and _say_frames(each)]
         if len(told) == 1 and _key_of("", content) is None:
             return _frames(path, told[0], num_frames)
         if inner is not None or "shapes" in content:
             return [people_of(str(path), content)]
-        if content and all(map(_PERSON.fullmatch, content)):
+        if content and (all(map(_PERSON.fullmatch, content)) or _are_people(content, num_frames)):
             return _of_people({who: _frames(path, own, num_frames) for who, own in content.items()})
         if content and all(isinstance(value, (dict, list)) for value in content.values()):
             found = {key: people_of(f"{path}: {key}", value) for key, value in content.items()}
@@ -276,8 +281,7 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     if len(set(keys)) == len(keys) and _are_durations(keys):
         keys = [None] * len(keys)
     if all(key is None for key in keys):
-        one = num_frames == 1 or is_joints(content)
-        if one or not content:
+        if num_frames == 1 or is_joints(content) or not content:
             return [people_of(str(path), content)]
         return [people_of(f"{path}: frame {index}", entry) for index, entry in enumerate(content)]
     found: Frames = {}
@@ -292,6 +296,38 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     if isinstance(first_of(content[0], (time or "",)), str):
         time = "seconds"
     return found if time is None else in_seconds(time, found)
+
+
+def _by_joint(content: Mapping[str, Any]) -> list[dict[str, Any]] | None:
+    """The frames of a file that has joints by name, and each in all frames; None: it is another."""
+    if not content or not all(map(canonical_joint_name, content)):
+        return None
+    columns = [_of_columns(each) for each in content.values()]
+    if len({*map(len, columns)}) != 1 or not is_joints(columns[0]):
+        columns = [[each] for each in content.values()]  # in one frame
+        if not is_joints([*content.values()]):
+            return None
+    rows = (zip(content, row, strict=True) for row in zip(*columns, strict=True))
+    return [{"keypoints": {name: joint for name, joint in row if joint}} for row in rows]
+
+
+def _of_columns(joint: Any) -> list[Any]:
+    """A joint's places in all frames, which may be lists of x, of y and of confidences."""
+    columns = [*joint.values()] if isinstance(joint, dict) else []
+    if not columns or not all(isinstance(each, list) for each in columns):
+        return listed(joint)
+    return [dict(zip(joint, row, strict=True)) for row in zip(*columns, strict=False)]
+
+
+def _are_people(content: Mapping[str, Any], num_frames: int | None) -> bool:
+    """Whether people have numbers, and below them more frames than there are people (AlphaPose)."""
+    people = [own if isinstance(own, dict) else {"": own} for own in content.values()]
+    frames = {key: each for own in people for key, each in own.items()}
+    numbered = all(re.fullmatch("[0-9]{1,9}", key) for key in (*content, *frames))
+    if not numbered or any(is_joints([each]) for each in frames.values()):
+        return False
+    fewer = num_frames is None or len(frames) <= num_frames
+    return fewer and sum(map(len, people)) > len(content) ** 2
 
 
 def _of_people(found: Mapping[str, list[list[Person]] | Frames]) -> list[list[Person]] | Frames:

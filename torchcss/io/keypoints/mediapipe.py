@@ -21,7 +21,7 @@ from torchcss.io.keypoints.people import (
     joint_counts,
     screened,
 )
-from torchcss.joint_names import ALIASES, names_in
+from torchcss.joint_names import ALIASES, CASE, names_in
 
 LAYOUT = "MediaPipe-33"
 NUM_LANDMARKS = len(ALIASES[LAYOUT])
@@ -52,8 +52,11 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
         frames: The people.
         names: Names of their joints, or none; what comes in an order has none any more.
     """
-    plain = [re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") for name in names]
-    plain = [name.removeprefix("poselandmark_") for name in plain]  # of Python's enumeration
+    spaced = (re.sub(CASE, " ", name).lower() for name in names)
+    plain = [re.sub(r"[^a-z0-9]+", "_", name).strip("_") for name in spaced]
+    # Of Python's enumeration, and of ML Kit's.
+    plain = [re.sub("^pose_landmark_(type_)?", "", name) for name in plain]
+    plain = [re.sub("^(left|right)_mouth$", r"mouth_\1", name) for name in plain]
     if plain and all(map(str.isdecimal, plain)):
         frames = _by_number(frames, [int(number) for number in plain])
         order = [*range(NUM_LANDMARKS)]

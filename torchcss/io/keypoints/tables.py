@@ -67,8 +67,8 @@ _POINTS = r"((landmark|lm|joint|keypoint|kpt|kp|point|pose)s?(_|(?=[0-9])))+"
 _OF_BODY_PARTS = re.compile("hand|face|finger")
 """What points beside those of a numbered body are called."""
 
-_BODY = {*names_in("pose body poselandmarks")}
-"""What the body is called among them."""
+_BODY = re.compile("pose|body")
+"""How what the body is called among them begins."""
 
 _ABSENT = names_in("nan none null na n/a #n/a <na> -")
 
@@ -163,10 +163,10 @@ def _of_the_body(rows: list[Row], joint: int, report: list[str]) -> list[Row]:
     body = rows[1:]
     for column in {*range(min(len(row) for _, row in body))} - {joint}:
         parts = [words.plain_word(row[column]) for _, row in body]
-        others = sorted({*parts} - _BODY)
+        others = sorted(part for part in {*parts} if not _BODY.match(part))
         if 0 < len(others) < len({*parts}) and all(map(_OF_BODY_PARTS.search, others)):
             report.append(f"rows left out: {', '.join(others)}")
-            return [rows[0], *(r for r, part in zip(body, parts, strict=True) if part in _BODY)]
+            return [rows[0], *(row for row, n in zip(body, parts, strict=True) if _BODY.match(n))]
     return rows
 
 
@@ -344,7 +344,8 @@ def _with_one_heading(rows: list[Row]) -> list[Row]:
         joint = cell or joint
         heading.append(f"{joint} {kind}" if kind.lower() in _PARTS else cell or kind)
     rest = rows[2:]
-    if rest and len(_ended(rest[0])) == 1 and not heading[0]:  # what pandas calls the index
+    # What pandas calls the index.
+    if rest and len(_ended(rest[0])) == 1 and not _NUMBER.match(rest[0][1][0] or "0"):
         heading[0], rest = rest[0][1][0], rest[1:]
     return [(number, heading), *rest]
 

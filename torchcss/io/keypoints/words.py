@@ -60,7 +60,7 @@ CONFIDENCES = names_in(
 JOINT_WORDS = (
     *(f"{of}{what}"
       for of in names_in("landmark joint keypoint kpt bodypart part node marker point")
-      for what in ("", "name", "id", "index", "idx", "type")),
+      for what in ("", "s", "name", "id", "index", "idx", "type")),
     *names_in("name label class classname id index idx classid type"),
 )  # fmt: skip
 """The name of a joint, or else its number."""
