@@ -34,18 +34,20 @@ from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
 from torchcss.files import load_json, real_numbers
+from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import CovarianceScaled, Spherical
 from torchcss.show.style import OKABE_ITO, save_figure
+from torchcss.studies.minima import FoundMinima
 from torchcss.studies.reprojection import ReprojectionProblem
 from torchcss.studies.sampling_study import (
     Lengths,
     SamplerRun,
     StudyChoice,
-    num_shared,
     run_sampler,
     spectrum,
     study_problem,
 )
+from torchcss.types import Modes
 
 COLUMNS = {
     "minima": "minima",
@@ -199,6 +201,34 @@ def run_seed(config: Config, seed: int) -> dict[str, Any]:
     ratio = {name: values[0] / values[-1] for name, values in spectra.items()}
     return {"seed": seed, "spectrum_ratio": ratio, "start_cost": float(problem.start.cost),
             "seconds": sum(row["seconds"] for row in rows), "rows": rows}  # fmt: skip
+
+
+def num_shared(
+    first: FoundMinima, second: FoundMinima, start: Modes, *, distance: float = 1.0
+) -> int:
+    """How many minima of one run another one found too.
+
+    Two minima are the same where they are closer than a threshold in the metric of either; the
+    tests by which a run tells its own minima apart are `other_minima`.
+
+    Args:
+        first: The run whose minima are looked for.
+        second: The run among whose minima they are looked for.
+        start: What both started from.
+        distance: The threshold, standard deviations.
+    """
+    mine, theirs = (
+        GaussianMixture(
+            found.modes.mean[found.minima],
+            found.modes.covariance[found.minima],
+            start.cost.new_zeros(len(found.minima)),
+        )
+        for found in (first, second)
+    )
+    if not len(mine.mean) or not len(theirs.mean):
+        return 0
+    apart = torch.minimum(mine.squared_distance(theirs.mean).mT, theirs.squared_distance(mine.mean))
+    return int((apart.amin(-1) <= distance**2).sum())
 
 
 def medians(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -11,7 +11,14 @@ import pytest
 import torch
 
 from torchcss.inference.proposals import CovarianceScaled
-from torchcss.studies.sampling_study import StudyChoice, run_sampler, spectrum, study_problem
+from torchcss.studies.reprojection import ReprojectionProblem
+from torchcss.studies.sampling_study import (
+    SamplerRun,
+    StudyChoice,
+    run_sampler,
+    spectrum,
+    study_problem,
+)
 
 
 def test_small_mode(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,10 +72,34 @@ def test_medians_and_a_given_pose(script: ModuleType, tmp_path: Path) -> None:
     assert bool(problem.bounds.lower.isinf().all())
 
 
-def test_figures_of_runs_with_and_without_minima(script: ModuleType) -> None:
-    problem = study_problem("arm8", generator=torch.Generator().manual_seed(0))
+@pytest.fixture(scope="module")
+def problem() -> ReprojectionProblem:
+    return study_problem("arm8", generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def run(problem: ReprojectionProblem) -> SamplerRun:
     proposal = CovarianceScaled(deviation_scale=4, include_modes=False)
-    run = run_sampler(problem, proposal, 100, generator=torch.Generator().manual_seed(1))
+    return run_sampler(problem, proposal, 100, generator=torch.Generator().manual_seed(1))
+
+
+def test_minima_that_two_runs_share(
+    script: ModuleType, problem: ReprojectionProblem, run: SamplerRun
+) -> None:
+    found, count = run.found, len(run.found.minima)
+    assert count > 1
+    assert script.num_shared(found, found, problem.start) == count
+    half = found._replace(minima=found.minima[: count // 2])
+    assert script.num_shared(half, found, problem.start) == count // 2
+    assert script.num_shared(found, half, problem.start) >= count // 2
+    nothing = found._replace(minima=found.minima[:0])
+    assert script.num_shared(nothing, found, problem.start) == 0
+    assert script.num_shared(found, nothing, problem.start) == 0
+
+
+def test_figures_of_runs_with_and_without_minima(
+    script: ModuleType, problem: ReprojectionProblem, run: SamplerRun
+) -> None:
     runs = {"CSS": run, "SS": run}
     assert len(script.samples_and_minima_figure(runs, "title").axes) == 12
     assert len(script.minima_and_costs_figure(runs).axes) == 2

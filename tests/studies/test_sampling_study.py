@@ -7,7 +7,6 @@ from torchcss.studies.sampling_study import (
     ExactSteps,
     StudyChoice,
     depth_flips,
-    num_shared,
     run_sampler,
     spectrum,
     study_problem,
@@ -69,18 +68,6 @@ def test_a_run_sums_itself_up(problem, run):
     torch.testing.assert_close(run.raw.distance, apart.norm(dim=-1))
     expected = (apart @ torch.linalg.inv(problem.start.covariance) * apart).sum(-1).sqrt()
     torch.testing.assert_close(run.raw.deviations, expected)
-
-
-def test_minima_that_two_runs_share(problem, run):
-    found, count = run.found, len(run.found.minima)
-    assert count > 1
-    assert num_shared(found, found, problem.start) == count
-    half = found._replace(minima=found.minima[: count // 2])
-    assert num_shared(half, found, problem.start) == count // 2
-    assert num_shared(found, half, problem.start) >= count // 2
-    nothing = found._replace(minima=found.minima[:0])
-    assert num_shared(nothing, found, problem.start) == 0
-    assert num_shared(found, nothing, problem.start) == 0
 
 
 def test_flips_are_named(problem):

@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.proposals import Proposal
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import squared_mahalanobis
@@ -31,7 +30,6 @@ from torchcss.types import (
     CostFunction,
     Items,
     LocalModel,
-    Modes,
     Numbers,
     Vector,
     Vectors,
@@ -294,31 +292,3 @@ def _lengths(problem: ReprojectionProblem, x: Tensor, cost: Tensor) -> Lengths:
     apart = x - problem.start.mean
     deviations = squared_mahalanobis(apart, problem.start.covariance).sqrt()
     return Lengths(apart.norm(dim=-1), deviations, cost - problem.start.cost)
-
-
-def num_shared(
-    first: FoundMinima, second: FoundMinima, start: Modes, *, distance: float = 1.0
-) -> int:
-    """How many minima of one run another one found too.
-
-    Two minima are the same where they are closer than a threshold in the metric of either; the
-    tests by which a run tells its own minima apart are `other_minima`.
-
-    Args:
-        first: The run whose minima are looked for.
-        second: The run among whose minima they are looked for.
-        start: What both started from.
-        distance: The threshold, standard deviations.
-    """
-    mine, theirs = (
-        GaussianMixture(
-            found.modes.mean[found.minima],
-            found.modes.covariance[found.minima],
-            start.cost.new_zeros(len(found.minima)),
-        )
-        for found in (first, second)
-    )
-    if not len(mine.mean) or not len(theirs.mean):
-        return 0
-    apart = torch.minimum(mine.squared_distance(theirs.mean).mT, theirs.squared_distance(mine.mean))
-    return int((apart.amin(-1) <= distance**2).sum())
