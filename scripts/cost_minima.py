@@ -35,8 +35,9 @@ from torchcss.files import prepare_output_folder
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
-from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes
-from torchcss.studies.slices import PROMINENCE, curve_minima, num_spurious
+from torchcss.studies.scenes import Scene, arm_scenes, sequence_scenes
+from torchcss.studies.sequences import read_sequence
+from torchcss.studies.slices import PROMINENCE, curve_minima
 from torchcss.tracking.settings import Settings, make_choice
 
 COUNTED_TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")
@@ -116,9 +117,11 @@ def scenes(config: Config) -> Iterator[Scene]:
         generator, name = torch.Generator().manual_seed(seed), f"arm {seed}"
         yield from arm_scenes(config.frames, generator=generator, settings=settings, name=name)
     if config.data is not None:
-        folder, settings = config.data / "balance_beam_4cam", replace(settings, body="body34")
-        generator = torch.Generator().manual_seed(0)
-        yield from clip_scenes(folder, config.clip_frames, generator=generator, settings=settings)
+        clip = read_sequence(config.data / "balance_beam_4cam", view="cam01")
+        yield from sequence_scenes(
+            clip._replace(name="cam01"), config.clip_frames,
+            generator=torch.Generator().manual_seed(0), settings=replace(settings, body="body34"),
+        )  # fmt: skip
 
 
 def contour_of(scene: Scene, potential: type, sigma: float, k: float) -> TrackingCost:
@@ -151,7 +154,9 @@ def measure(scene: Scene, config: Config, curves: CountsByCase) -> None:
                 shown[name][f"k = {k:g}"] = edges
                 for terms, curve in (("contour", edges), ("contour + flow", edges + by_flow)):
                     minima, extent = curve_minima(curve), float(np.ptp(curve))
-                    counts = [num_spurious(minima.above(least * extent)) for least in LEAST]
+                    found = [len(minima.above(least * extent).sample) for least in LEAST]
+                    # One, wherever it is, is that of the truth.
+                    counts = [max(number - 1, 0) for number in found]
                     taken = SliceCounts(scene.name, counts, float(offsets[curve.argmin()]))
                     curves[body, terms, name, k].append(taken)
         if line.name == DRAWN and config.out is not None:

@@ -34,7 +34,7 @@ from torchcss.files import prepare_output_folder
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.show.style import OKABE_ITO, save_figure
 from torchcss.studies import plots
-from torchcss.studies.scenes import Scene, arm_scenes, clip_scenes, sequence_scenes
+from torchcss.studies.scenes import Scene, arm_scenes, sequence_scenes
 from torchcss.studies.sequences import read_sequence
 from torchcss.studies.slices import PROMINENCE, Slice, StateLine, sample_slice
 from torchcss.tracking.settings import Settings
@@ -112,15 +112,17 @@ def scenes(config: Config) -> Iterator[Scene]:
     generator = torch.Generator().manual_seed(config.seed)
     settings = Settings(body="arm8", preset=config.preset, terms=config.terms)
     yield from arm_scenes([config.frame], generator=generator, settings=settings)
+    settings = replace(settings, body="body34")
     if config.sequence is not None:
         sequence = read_sequence(config.sequence)
         frames = [round(time * sequence.frame_rate) for time in config.times]
-        yield from sequence_scenes(sequence, frames, settings=settings)
+        yield from sequence_scenes(sequence, frames, generator=generator, settings=settings)
     if config.data is not None:
-        folder, settings = config.data / "balance_beam_4cam", replace(settings, body="body34")
-        yield from clip_scenes(
-            folder, [config.clip_frame], generator=generator, view=config.view, settings=settings
-        )
+        clip = read_sequence(config.data / "balance_beam_4cam", view=config.view)
+        yield from sequence_scenes(
+            clip._replace(name=config.view), [config.clip_frame], generator=generator,
+            settings=settings,
+        )  # fmt: skip
 
 
 def look(scene: Scene, config: Config) -> list[dict[str, Any]]:

@@ -15,7 +15,6 @@ from torchcss.studies.slices import (
     eigen_lines,
     joint_lines,
     largest_jump,
-    num_spurious,
     sample_slice,
 )
 from torchcss.types import Bounds
@@ -54,8 +53,6 @@ def test_prominence_is_the_easier_climb_and_ends_are_no_minima() -> None:
     assert minima.sample.tolist() == [2, 4]
     assert minima.prominence.tolist() == [1.0, 4.0]  # over 4 to the 1; over 5 to the 0
     assert minima.above(2.0).sample.tolist() == [4]
-    assert num_spurious(minima) == 1
-    assert num_spurious(minima.above(100.0)) == 0
     for monotone in ([1.0, 2.0, 3.0], [3.0, 2.0, 2.0], [1.0] * 5, [1.0]):
         assert curve_minima(monotone).sample.tolist() == []
 

@@ -5,17 +5,15 @@ and that knows colours from that frame alone. A `Scene` adds the truth and the m
 optimiser reaches from there, whose covariance says along which lines the cost is worth a look
 (`torchcss.studies.slices`).
 
-Call `arm_scenes` for frames of the rendered arm, whose truth is exact, `sequence_scenes` for
-those of a sequence whose states are known, or `clip_scenes` for those of a recording with
-keypoints, where the fit to them that is nearest a 3D reference stands for the truth; then
-`Scene.lines` and `Scene.limits`.
+Call `arm_scenes` for frames of the rendered arm, whose truth is exact, or `sequence_scenes` for
+those of a recording: where its states are not known, the fit to the keypoints that is nearest the
+3D reference stands for the truth. Then `Scene.lines` and `Scene.limits`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -34,13 +32,11 @@ from torchcss.initialise.fit import initialise
 from torchcss.initialise.keypoint_checks import default_sigma
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.view import CameraView
-from torchcss.io.cameras import read_camera
-from torchcss.io.keypoints.read import read_keypoints
 from torchcss.io.video import VideoReader
 from torchcss.joint_names import LIMB_JOINTS
 from torchcss.studies.metrics import root_aligned_mpjpe_mm
 from torchcss.studies.render.sequences import arm_sequence
-from torchcss.studies.sequences import RecordedSequence, read_reference
+from torchcss.studies.sequences import RecordedSequence
 from torchcss.studies.slices import StateLine, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
 from torchcss.tracking.view import NOTHING_SEEN
@@ -123,84 +119,58 @@ def arm_scenes(
 
 
 def sequence_scenes(
-    sequence: RecordedSequence, frames: Sequence[int], *, settings: Settings
+    sequence: RecordedSequence,
+    frames: Sequence[int],
+    *,
+    generator: torch.Generator,
+    settings: Settings,
 ) -> Iterator[Scene]:
-    """Frames of a sequence whose states are known.
+    """Frames of a recorded sequence.
+
+    Where no states are known, body and truth come from the keypoints of the frame: of the distinct
+    fits to them, the one whose limbs are nearest the 3D reference. The state before is that fit,
+    moved to the keypoints there.
 
     Args:
         sequence: The sequence.
         frames: Which frames, none of them the first.
-        settings: Terms of the cost.
-
-    Raises:
-        ConfigurationError: If a frame has none before it, or no states are known.
-    """
-    _check_frames(frames)
-    if sequence.truth is None:
-        raise ConfigurationError(f"{sequence.name}: expected a sequence with the states, truth.npz")
-    body = sequence.truth.body.to(dtype=settings.torch_dtype)
-    view, states = CameraView(sequence.camera.to(settings.torch_dtype)), sequence.truth.states
-    for index in frames:
-        pair = tuple(VideoReader(sequence.video, start=index - 1, stop=index + 1))
-        known = states[index - 1 : index + 1].to(body.tie).unbind()
-        yield _scene(f"{sequence.name}, frame {index}", pair, known, body, view, settings)
-
-
-def clip_scenes(
-    folder: Path,
-    frames: Sequence[int],
-    *,
-    generator: torch.Generator,
-    view: str = "cam01",
-    settings: Settings | None = None,
-) -> Iterator[Scene]:
-    """Frames of a recording laid out as the balance-beam clip of the test data.
-
-    Body and truth come from the keypoints of the frame: of the distinct fits to them, the one whose
-    limbs are nearest the 3D reference. The state before is that fit, moved to the keypoints there.
-
-    Args:
-        folder: Holds `VIEW.mp4`, `keypoints2d_VIEW.npz`, `cameras.json`, and `reference3d.npz` with
-            `joints [T J 3]` in metres of the cameras' world frame and `joint_names`.
-        frames: Which frames, none of them the first.
-        generator: Source of the starting poses.
-        view: Which camera.
-        settings: Body and terms of the cost.
+        generator: Source of the starting poses of fits.
+        settings: Terms of the cost, and the body where none is known.
 
     Raises:
         ConfigurationError: If a frame has none before it.
-        TorchcssError: For any bad file.
+        TorchcssError: If the video cannot be read, or no body fits.
     """
     _check_frames(frames)
-    settings = settings or Settings()
-    for frame in frames:
-        yield _clip_scene(folder, frame, view, settings, generator)
+    dtype = settings.torch_dtype
+    view = CameraView(sequence.camera.to(dtype))
+    for index in frames:
+        pair = tuple(VideoReader(sequence.video, start=index - 1, stop=index + 1))
+        if sequence.truth is None:
+            body, states, view = _fitted(sequence, index, settings, generator)
+        else:
+            body = sequence.truth.body.to(dtype=dtype)
+            states = sequence.truth.states[index - 1 : index + 1].to(body.tie).unbind()
+        yield _scene(f"{sequence.name}, frame {index}", pair, states, body, view, settings)
 
 
-def _clip_scene(
-    folder: Path, frame: int, view: str, settings: Settings, generator: torch.Generator
-) -> Scene:
-    video = folder / f"{view}.mp4"
-    before, now = VideoReader(video, start=frame - 1, stop=frame + 1)
-    full = read_camera(folder / "cameras.json", video=video).to(settings.torch_dtype)
-    path = folder / f"keypoints2d_{view}.npz"
-    keypoints = read_keypoints(path, image_size_wh=full.image_size_wh)
+def _fitted(
+    sequence: RecordedSequence, frame: int, settings: Settings, generator: torch.Generator
+) -> tuple[BodyModel, tuple[Vector, ...], CameraView]:
+    """A body, its states before and in a frame, and the camera with the keypoints they fit."""
+    keypoints, camera = sequence.keypoints, sequence.camera.to(settings.torch_dtype)
     options = InitialiseOptions(least_joints=LEAST_JOINTS, dtype=settings.torch_dtype)
     first = initialise(
-        None, keypoints.at(frame), full, settings.body, generator=generator, options=options
+        None, keypoints.at(frame), camera, settings.body, generator=generator, options=options
     )
-    body = first.body
-    truth = _nearest(body, first.mixture.mean, folder / "reference3d.npz", frame)
-    sigma = default_sigma(keypoints.at(frame))
+    body, sigma = first.body, default_sigma(keypoints.at(frame))
+    truth = _nearest(body, first.mixture.mean, sequence, frame)
+    before = FrameContext(body=body, camera=camera, keypoints=keypoints.at(frame - 1).to(body.tie))
     alone = TrackingCost(
-        choice=make_choice(Settings(terms=("joints", "stabiliser")), sigma),
-        views=(
-            FrameContext(body=body, camera=full, keypoints=keypoints.at(frame - 1).to(body.tie)),
-        ),
+        choice=make_choice(Settings(terms=("joints", "stabiliser")), sigma), views=(before,)
     )
     previous = TrustRegionNewton().minimise(alone, truth[None], body.bounds).mean[0]
-    eye, states = CameraView(full, keypoints, sigma), (previous, truth)
-    return _scene(f"{view}, frame {frame}", (before, now), states, body, eye, settings)
+    return body, (previous, truth), CameraView(camera, keypoints, sigma)
 
 
 def _scene(
@@ -223,12 +193,14 @@ def _scene(
     return Scene(name, now.image, seen.features, cost, truth, mode.take(0))
 
 
-def _nearest(body: BodyModel, fits: Float[Tensor, "k n"], reference: Path, frame: int) -> Tensor:
+def _nearest(
+    body: BodyModel, fits: Float[Tensor, "k n"], sequence: RecordedSequence, frame: int
+) -> Tensor:
     """The state whose limbs are nearest the reference once the roots are on each other."""
-    positions, names = read_reference(reference)
+    names = sequence.joint_names
     common = [name for name in LIMB_JOINTS if name in names and name in body.joint_names]
     fitted = body.pose(fits).joints[:, body.joint_columns(common)]
-    true = positions[frame, [names.index(name) for name in common]]
+    true = sequence.joints_world[frame, [names.index(name) for name in common]]
     return fits[int(np.argmin(root_aligned_mpjpe_mm(fitted.cpu(), true, common)))]
 
 

@@ -179,11 +179,6 @@ def curve_minima(values: Float[ArrayLike, " s"]) -> Minima:
     return Minima(sample, found["prominences"])
 
 
-def num_spurious(minima: Minima) -> int:
-    """How many minima there are besides the one nearest the truth, wherever that one is."""
-    return max(len(minima.sample) - 1, 0)
-
-
 def largest_jump(values: Float[ArrayLike, " s"]) -> float:
     """Largest difference between neighbouring samples of a curve."""
     return float(np.abs(np.diff(np.asarray(values, float))).max())
