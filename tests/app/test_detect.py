@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -194,6 +195,24 @@ def test_a_rate_that_a_film_does_not_need_is_told(files: Path) -> None:
     given = ViewFiles(video=files / "video.mp4", keypoints=None, frame_rate=120)
     view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0))
     assert any("as the video says: --frame-rate is of pictures" in note for note in view.notes)
+
+
+@pytest.mark.parametrize(("codec", "suffix"), [("libx264", "h264"), ("mjpeg", "mjpeg")])
+def test_the_guessed_rate_of_a_bare_stream_is_told(tmp_path: Path, codec: str, suffix: str) -> None:
+    """Cameras of single-board computers write such files; FFmpeg takes 25 frames a second then."""
+    path = tmp_path / f"a.{suffix}"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=50)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        picture = av.VideoFrame.from_ndarray(np.zeros((*SIZE[::-1], 3), np.uint8), "rgb24")
+        for frame in (picture, picture, None):
+            container.mux(stream.encode(frame))
+    view = open_view(ViewFiles(video=path, keypoints=None), Camera.pinhole(*SIZE, focal_px=60.0))
+    rate = 25 if codec == "mjpeg" else 50  # H.264 may say its own
+    (note,) = [note for note in view.notes if "images a second" in note]
+    assert note.startswith(f"{rate} images a second, assumed")
+    assert f"-i a.{suffix} -c" in note
 
 
 def test_who_goes_on_further_looks_further(

@@ -67,13 +67,18 @@ class OpenView(NamedTuple):
         """What the files' readers have to say, for the user."""
         notes = [self.camera.units_note, *camera_findings(self.camera.camera)]
         notes += [self.reader.varying_rate(), self.reader.left_out]
+        rate = float(self.reader.info.frame_rate)
         if self.reader.image_names is not None:
             given = "as given" if self.files.frame_rate else "assumed: say it with --frame-rate"
-            notes.insert(0, f"{float(self.reader.info.frame_rate):g} images a second, {given}")
+            notes.insert(0, f"{rate:g} images a second, {given}")
             notes += [several_kinds(self.reader.image_names)]
             notes += [missing_numbers(self.reader.image_names)]
+        elif self.reader.is_untimed:
+            notes.append(
+                f"{rate:g} images a second, assumed, for the file holds no times: ffmpeg "
+                f"-framerate RATE -i {self.files.video.name} -c copy NEW.mp4 makes one that does"
+            )
         elif self.files.frame_rate is not None:
-            rate = float(self.reader.info.frame_rate)
             notes.append(
                 f"{rate:g} images a second, as the video says: --frame-rate is of pictures"
             )

@@ -114,6 +114,8 @@ class VideoReader:
         pixel_aspect: Width of a pixel against its height.
         left_out: A line about what is not read, if there is such: pictures of other kinds in a
             folder, further films in a file.
+        is_untimed: Whether the file is a bare stream without times, as cameras of single-board
+            computers write it, so that its frame rate is a guess.
 
     Raises:
         VideoError: If nothing can be read, no frame is selected, or the stride is not positive.
@@ -122,6 +124,7 @@ class VideoReader:
     info: VideoInfo
     pixel_aspect = Fraction(1)
     left_out: str | None = None
+    is_untimed = False
 
     def __init__(
         self,
@@ -282,12 +285,17 @@ class VideoReader:
         )
 
     def _probe_container(self) -> VideoInfo:
+        from av.format import Flags
+
         try:
             with self.opened() as container:
                 if not container.streams.video:
                     raise self._not_a_video("it holds no pictures")
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate or stream.base_rate
+                self.is_untimed = bool(container.format.flags & Flags.no_timestamps.value)
+                if self.is_untimed:  # its mean is FFmpeg's default, whatever the stream says
+                    rate = stream.guessed_rate or rate
                 num_frames = stream.frames or None
                 duration = (stream.duration or 0) * (stream.time_base or 0) * (rate or 0)
                 if num_frames and duration and "mp4" in container.format.name:

@@ -159,6 +159,15 @@ def test_c3d(tmp_path: Path, frame: str | None, screen: tuple[str, str], turn: n
         assert np.isnan(file.points[~present]).all()
 
 
+def test_c3d_refuses_places_that_its_numbers_cannot_tell_apart(tmp_path: Path):
+    """At 4200 km from the origin, as in UTM coordinates, single precision has steps of 0.5 m."""
+    track = make_track(body_named("arm7"))
+    far = track._replace(joints_world=track.joints_world + np.array([5e5, 4.2e6, 0.0]))
+    with pytest.raises(ConfigurationError, match=r"4\d{6} m from .* 0\.5 m apart; .* trc or csv"):
+        export_as(far, to="c3d", out=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_c3d_without_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(MissingExtraError, match=r"pip install .*\[c3d\]"):
