@@ -10,6 +10,8 @@ import pytest
 import torch
 
 import torchcss.app.init as app_init
+from torchcss.body.catalog import PROPORTIONS
+from torchcss.initialise.multi_start import PAPER_LENGTHS, StartSearch
 from torchcss.initialise.noise import Noise
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.settings import Settings
@@ -37,5 +39,7 @@ def test_a_papers_preset_has_the_papers_priors(
     )
     options, row = asked["options"], PRESETS[preset]
     assert options.printed == (None if row.cost == "ours" else row.cost)
+    proportions = PROPORTIONS if row.cost == "ours" else PAPER_LENGTHS
+    assert options.search == StartSearch(proportions=proportions)
     ours = row.terms == "default"
     assert (options.pose_prior, options.colours) == (ours, ours)

@@ -23,10 +23,12 @@ from typing import Any
 import torch
 
 from torchcss.app.lens import KnownLens
+from torchcss.body.catalog import PROPORTIONS
 from torchcss.body.load import load_body
 from torchcss.errors import KeypointError
 from torchcss.files import prepare_output_folder, replace_file
 from torchcss.initialise.fit import initialise
+from torchcss.initialise.multi_start import PAPER_LENGTHS, StartSearch
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.initialise.result import Initialisation, stature_of
@@ -200,7 +202,7 @@ def initialise_video(
         keypoints: Its keypoints in every frame.
         camera: Its camera.
         settings: Body, terms, working size, type and device. A paper's preset has the paper's
-            priors (`InitialiseOptions.printed`).
+            priors (`InitialiseOptions.printed`) and proportions (`PAPER_LENGTHS`).
         start: The frame.
         noise: Noise of the keypoints.
         generator: Source of the starting poses.
@@ -218,6 +220,7 @@ def initialise_video(
         least_joints=LEAST_JOINTS,
         pose_prior="pose_prior" in settings.used_terms,
         printed=None if paper == "ours" else paper,
+        search=StartSearch(proportions=PROPORTIONS if paper == "ours" else PAPER_LENGTHS),
         contours="contour" in settings.used_terms,
         colours="region" in settings.used_terms,
         working_size=settings.working_size,
