@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import operator
 from typing import Any
 
 import torch
@@ -106,6 +107,25 @@ def check_positive(choice: object, *names: str, hint: str = "", finite: bool = F
         if value is not None and not (value > 0 and (value < math.inf or not finite)):
             where = f"{type(choice).__name__}.{name}"
             raise ConfigurationError(f"{where}: expected a positive number, got {value}{hint}")
+
+
+def make_whole(choice: object, *names: str) -> None:
+    """Make Python's of the whole numbers of a frozen record of choices: NumPy's are no JSON.
+
+    Args:
+        choice: A record of choices.
+        names: Its attributes; None stays.
+
+    Raises:
+        ConfigurationError: If one is no whole number.
+    """
+    for name in names:
+        value = getattr(choice, name)
+        try:
+            object.__setattr__(choice, name, None if value is None else operator.index(value))
+        except TypeError as error:
+            where = f"{type(choice).__name__}.{name}"
+            raise ConfigurationError(f"{where}: expected a whole number, got {value!r}") from error
 
 
 def check_range(

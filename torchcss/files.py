@@ -12,6 +12,7 @@ import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -173,6 +174,14 @@ def write_text(path: Path, text: str) -> None:
 def temporary_name(path: Path) -> Path:
     """A new name beside `path` to write under; two machines may have processes of one number."""
     return path.with_name(f".{path.stem}.{uuid.uuid4().hex}.partial{path.suffix}")
+
+
+def make_paths(record: Any) -> None:
+    """Make paths of the strings that a frozen record of choices was given for its files."""
+    for each in fields(record):
+        value = getattr(record, each.name)
+        if isinstance(value, str) and str(each.type).startswith("Path"):
+            object.__setattr__(record, each.name, Path(value))
 
 
 def prepare_output_folder(path: StrPath) -> Path:

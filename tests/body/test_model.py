@@ -198,6 +198,15 @@ def test_a_mesh_is_that_of_the_present_shape() -> None:
     assert body.to(torch.float32).mesh(6, 10).points.dtype == torch.float32
 
 
+def test_a_mesh_of_inference_mode_is_not_kept() -> None:
+    body = load_body("arm8")
+    with torch.inference_mode():
+        body.mesh()
+    x = body.rest.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(body.surface(body.pose(x)).points.sum(), x)
+    assert bool(slope.any())
+
+
 def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
     body = load_body("body34")
     x = random_states(body, 2, generator=generator)

@@ -14,6 +14,7 @@ from made_tracks import make_track, save_v01_track
 
 import torchcss
 from torchcss import Run, load_body
+from torchcss.app.track import TrackOptions
 from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.shape import with_shape
@@ -175,6 +176,10 @@ def test_what_is_given_counts_first(track: Track, tmp_path: Path) -> None:
         .files
     )
     assert files == ViewFiles(video=Path("new.mp4"), keypoints=Path("new.npz"))
+    by_name = Given(video="new.mp4"), GivenKeypoints(keypoints="new.npz")  # type: ignore[arg-type]
+    assert Run.open(tmp_path, *by_name).cameras[0].files == files
+    assert TrackOptions(masks="new.mp4").masks == Path("new.mp4")  # type: ignore[arg-type]
+    assert len(repr(other)) < 200
     with pytest.raises(TrackFileError, match="no camera 'up'; it has left, right"):
         Run.open(tmp_path, Given(camera_name="up"))
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import pickle
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +22,7 @@ from torch import Tensor
 
 import torchcss
 from torchcss.app.track import TrackOptions, first_pose_from_file, track_video
+from torchcss.app.view_files import FrameSelection
 from torchcss.body.load import load_body
 from torchcss.cost.joints import JointTerm
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
@@ -33,6 +36,7 @@ from torchcss.initialise.view import CameraView
 from torchcss.io import tracks
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body
 from torchcss.io.run import Run, body_of_track
+from torchcss.io.tracks import Track
 from torchcss.io.video import VideoWriter
 from torchcss.robust import Quadratic
 from torchcss.studies.demo import run_demo
@@ -48,6 +52,7 @@ from torchcss.tracking.settings import (
     make_plan,
     make_tracker,
     named_terms,
+    settings_from_plain,
 )
 from torchcss.types import Bounds, Frame
 from torchcss.vision.camera import Camera
@@ -250,7 +255,7 @@ def test_truncated_video_keeps_the_frames(clip: Path, tmp_path: Path):
     [
         {"terms": ("contour", "magic")}, {"samples": 0}, {"working_size": 0}, {"device": "cuda:99"},
         {"keypoints_use": "frist"}, {"engine": "none"}, {"dtype": "float16"}, {"dtype": None},
-        {"curvature": "some"}, {"prediction": "none"},
+        {"curvature": "some"}, {"prediction": "none"}, {"modes": 2.5}, {"samples": "6"},
     ],
 )  # fmt: skip
 def test_bad_settings(bad: dict):
@@ -274,6 +279,23 @@ def test_settings_out_of_range_are_refused_by_name(name: str, bad: tuple, good: 
             Settings(**{name: value})
     for value in good:
         assert getattr(Settings(**{name: value}), name) == value
+
+
+def test_settings_of_other_types_are_those_of_a_file(tmp_path: Path):
+    given = {"samples": np.int64(6), "likelihood_power": np.float32(0.25), "seed": np.int64(3)}
+    more = {"recovery": np.bool_(False), "weights": {"flow": np.float32(2)}, "terms": "still"}
+    others = {"body": Path("arm8"), "device": torch.device("cpu")}
+    made = Settings(**given, **more, **others)
+    track = Track.empty((), ())._replace(settings=asdict(made))
+    tracks.save_track(tmp_path / "track.npz", track)
+    held = tracks.load_track(tmp_path / "track.npz").settings
+    assert settings_from_plain(held) == made
+    assert {name: type(held[name]) for name in ("samples", "likelihood_power", "recovery")} == {
+        "samples": int, "likelihood_power": float, "recovery": bool,
+    }  # fmt: skip
+    torch.Generator().manual_seed(made.seed)
+    selection = FrameSelection(start=np.int64(1), stop=np.int64(3))
+    assert json.dumps(asdict(selection)) == '{"start": 1, "stop": 3, "stride": 1}'
 
 
 def test_a_body_from_a_file_is_the_same_by_any_path(
@@ -881,12 +903,27 @@ def test_a_session_with_parts_of_its_own_is_resumed_with_them():
     assert [len(mean) for mean in means] == [1, 1, 2]
 
 
+def test_a_pickled_session_goes_on_as_itself():
+    sequence = rendered_arm(0, 3)
+    view = seen_by(sequence.camera, sequence.joints_world, sequence.body.joint_names)
+    settings = Settings(body="arm8", working_size=160, samples=4, modes=2)
+    session = session_at(settings, sequence.body, sequence.states[0], view)
+    list(session.track(sequence.frames[:1]))
+    other = pickle.loads(pickle.dumps(session))
+    one, same = (
+        list(each.track(sequence.frames[1:]))[-1].state.mixture for each in (session, other)
+    )
+    assert torch.equal(one.mean, same.mean)
+
+
 @pytest.mark.parametrize(
     ("image", "message"),
     [
         (np.zeros((5, 7, 3), np.uint8), r"belongs to images of \(640, 480\).* has \(7, 5\)"),
         (torch.zeros(480, 640, 3), "as a NumPy array, or a Frame of them, got a Tensor"),
         ("frame.png", "got a str"),
+        (Path("frame.png"), "got a PosixPath"),
+        (None, "the first view has none"),
         ([None], "the first view has none"),
         ([], "the first view has none"),
     ],
@@ -911,9 +948,17 @@ def test_views_that_say_nothing_of_the_body_are_told():
         (known.at(0), "expected those of all frames"),
         (known._replace(positions=known.positions[:, :2]), "keypoints.positions: expected a shape"),
         (known._replace(confidence=known.confidence[0]), "expected one of each"),
+        (known._replace(positions=known.positions.long()), "positions: expected float32 or"),
+        (known._replace(points=known.positions), "keypoints.points: expected a shape"),
+        ({"l_wrist": (1, 2)}, "expected of each its Camera and Keypoints, if any, got .* and dict"),
     ):
         with pytest.raises(TorchcssError, match=message):
             TrackingSession(Settings(body="arm8"), first, view._replace(keypoints=keypoints))
+    by_file = known._replace(names=np.array(known.names))
+    TrackingSession(Settings(body="arm8"), first, view._replace(keypoints=by_file))
+    pair: Any = [(view.camera, known)]
+    with pytest.raises(ConfigurationError, match="its Camera and Keypoints, if any, got tuple"):
+        TrackingSession(Settings(body="arm8"), first, pair)
     with pytest.raises(ConfigurationError, match="sigma: expected a number of pixels"):
         TrackingSession(Settings(body="arm8"), first, view._replace(sigma=0.0))
     for interval in (0.0, -1.0, math.nan):

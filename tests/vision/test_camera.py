@@ -387,10 +387,18 @@ def test_state_survives_saving_and_nearly_orthonormal_rotations_are_mended() -> 
     camera, other = make_camera(WILD), make_camera(None)
     other.load_state_dict(camera.state_dict())
     assert torch.equal(other.maximum_radius, camera.maximum_radius)
+    points = torch.tensor([[0.3, -0.2, 4.0], [-0.5, 0.4, 5.0]], dtype=torch.float64)
+    assert torch.equal(other.project(points).uv, camera.project(points).uv)
     rounded = torch.tensor(np.round(camera.R_camera_world.numpy(), 5))
     mended = Camera(camera.K, (640, 480), R_camera_world=rounded).R_camera_world
     torch.testing.assert_close(mended @ mended.mT, torch.eye(3, dtype=torch.float64))
     assert "640 x 480" in repr(camera)
+
+
+def test_values_of_any_type_are_taken() -> None:
+    values = torch.diag(torch.tensor([8.0, 8.0, 1.0]))
+    for dtype in (torch.bfloat16, torch.float16, torch.int64):
+        assert torch.equal(Camera(values.to(dtype), (4, 3)).K, values.double())
 
 
 @pytest.mark.parametrize(
@@ -425,6 +433,12 @@ def test_bad_points_are_refused() -> None:
         camera.project(torch.zeros(4, 2))
     with pytest.raises(ShapeError, match="uv"):
         camera.rays(torch.zeros(4, 3))
+    # A translation in whole metres would be the wrong one.
+    for dtype in (torch.int64, torch.float16):
+        with pytest.raises(ShapeError, match="points_world: expected float32 or float64"):
+            camera.project(torch.ones(4, 3, dtype=dtype))
+        with pytest.raises(ShapeError, match="uv: expected float32 or float64"):
+            camera.rays(torch.ones(4, 2, dtype=dtype))
     with pytest.raises(CameraError, match="scale factor"):
         camera.scaled(0.0)
 

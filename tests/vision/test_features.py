@@ -57,6 +57,19 @@ def test_all_kinds_of_pictures_give_the_same_features(picture: torch.Tensor) -> 
         torch.testing.assert_close(features.edge_energy, expected.edge_energy, rtol=0.0, atol=1e-4)
 
 
+def test_torchs_default_type_changes_nothing(picture: torch.Tensor) -> None:
+    expected, before = FeatureExtractor()(picture), torch.get_default_dtype()
+    for dtype in (torch.float64, torch.float16):
+        torch.set_default_dtype(dtype)
+        try:
+            features = FeatureExtractor()(picture)
+        finally:
+            torch.set_default_dtype(before)
+        assert features.grey.dtype == torch.float32
+        assert torch.equal(features.grey, expected.grey)
+        assert torch.equal(features.edge_energy, expected.edge_energy)
+
+
 def test_features_follow_the_dtype_of_the_module(picture: torch.Tensor) -> None:
     features = FeatureExtractor().to(torch.float64)(picture, mask=picture[..., 0] > 100)
     assert features.mask is not None

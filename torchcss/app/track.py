@@ -35,7 +35,7 @@ from torchcss.errors import (
     TrackFileError,
     check_positive,
 )
-from torchcss.files import StrPath, naming, prepare_output_folder
+from torchcss.files import StrPath, make_paths, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
 from torchcss.initialise.result import Initialisation, check_stature, stature_of
@@ -108,6 +108,7 @@ class TrackOptions:
     detect: DetectOptions = DetectOptions()
 
     def __post_init__(self) -> None:
+        make_paths(self)
         check_positive(self, "sigma", finite=True)
         if not self.checkpoint_every >= 0:
             raise ConfigurationError(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from torchcss.errors import CameraError, VideoError
+from torchcss.errors import CameraError, VideoError, make_whole
 from torchcss.files import naming
 from torchcss.initialise.keypoint_checks import typical_sigma
 from torchcss.initialise.view import CameraView
@@ -151,6 +151,9 @@ class FrameSelection:
     start: int = 0
     stop: int | None = None
     stride: int = 1
+
+    def __post_init__(self) -> None:
+        make_whole(self, "start", "stop", "stride")
 
 
 def open_view(

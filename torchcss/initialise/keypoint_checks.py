@@ -14,7 +14,7 @@ import torch
 
 from torchcss.body.root import has_root
 from torchcss.cost.total import TrackingCost
-from torchcss.errors import KeypointError, check_shape
+from torchcss.errors import KeypointError, check_floating, check_shape
 from torchcss.files import refusing
 from torchcss.initialise.multi_start import StartSearch, multi_start_fits
 from torchcss.initialise.outliers import capped_cost
@@ -68,13 +68,16 @@ def check_numbers(keypoints: Keypoints, *, frames: bool) -> None:
         frames: Whether they are to be of all frames.
 
     Raises:
-        ShapeError: If they are no tensors, or not pairs of a joint each.
+        ShapeError: If they are no tensors of a floating type, or not pairs of a joint each.
         KeypointError: If the confidences are of another shape, or it is one image instead of all
             frames or the other way round.
     """
     places, confidence = keypoints.positions, keypoints.confidence
     check_shape("keypoints.positions", places, len(keypoints.names), 2)
+    check_floating("keypoints.positions", places)
     check_shape("keypoints.confidence", confidence)
+    if keypoints.points is not None:
+        check_shape("keypoints.points", keypoints.points, *confidence.shape, 3)
     if confidence.shape != places.shape[:-1]:
         raise KeypointError(
             f"keypoints: {list(places.shape)} places have confidences {list(confidence.shape)}; "

@@ -72,17 +72,23 @@ class CameraView(NamedTuple):
             body: The body.
 
         Raises:
-            ConfigurationError: If their noise is no number of pixels.
-            ShapeError: If they are no tensors, or not pairs of a joint each.
+            ConfigurationError: If their noise is no number of pixels, or camera or keypoints are
+                something else.
+            ShapeError: If they are no tensors of a floating type, or not pairs of a joint each.
             KeypointError: If they are not those of all frames, or of none of the body's joints.
         """
+        if not (isinstance(self.camera, Camera) and isinstance(self.keypoints, Keypoints | None)):
+            raise ConfigurationError(
+                "views: expected of each its Camera and Keypoints, if any, got "
+                f"{type(self.camera).__name__} and {type(self.keypoints).__name__}"
+            )
         if self.sigma is not None and not 0 < self.sigma < math.inf:
             raise ConfigurationError(f"sigma: expected a number of pixels, got {self.sigma}")
         if self.keypoints is None:
             return
         check_numbers(self.keypoints, frames=True)
         names = self.keypoints.names
-        if names and not set(names) & set(body.joint_names):
+        if len(names) and not set(names) & set(body.joint_names):
             raise KeypointError(
                 f"{body.name} has none of the joints {shortened(', '.join(names))}; its own are "
                 f"{shortened(', '.join(body.joint_names))}"

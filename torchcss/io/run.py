@@ -24,7 +24,7 @@ from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES
 from torchcss.errors import TorchcssError, TrackFileError
-from torchcss.files import StrPath
+from torchcss.files import StrPath, make_paths
 from torchcss.io.cameras import read_camera
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
@@ -55,6 +55,9 @@ class Given:
     camera_name: str | None = None
     video: Path | None = None
 
+    def __post_init__(self) -> None:
+        make_paths(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class GivenKeypoints:
@@ -73,6 +76,9 @@ class GivenKeypoints:
     normalised: Scale | None = None
     masks: Path | None = None
 
+    def __post_init__(self) -> None:
+        make_paths(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
@@ -85,8 +91,8 @@ class Run:
     """
 
     path: Path
-    track: Track
-    summary: Mapping[str, Any] = field(default_factory=dict)
+    track: Track = field(repr=False)
+    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def open(

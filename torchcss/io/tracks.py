@@ -353,7 +353,7 @@ def _arrays(track: Track) -> dict[str, Any]:
         "cameras": [camera_to_plain(camera) for camera in track.cameras],
         "settings": dict(track.settings),
     }
-    arrays |= {name: json.dumps(value, default=str) for name, value in plain.items()}
+    arrays |= {name: json.dumps(value, default=_plain) for name, value in plain.items()}
     return {"schema_version": TRACK_VERSION, **arrays}
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from torchcss.errors import ConfigurationError
+from torchcss.files import make_paths
 from torchcss.io.cameras import camera_entry
 from torchcss.io.keypoints.read import Scale
 from torchcss.vision.camera import Camera
@@ -53,6 +54,9 @@ class ViewFiles:
     frame_rate: float | None = None
     person: str = "prominent"
     sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        make_paths(self)
 
     def fingerprints(self) -> dict[str, str]:
         """What tells each of its files from others, wherever it lies."""

@@ -266,7 +266,7 @@ class TrackingSession:
             raise ConfigurationError("views: expected at least one camera that looks on, got none")
         if not 0 < frame_interval < math.inf:
             raise ConfigurationError(f"frame_interval: expected seconds, got {frame_interval}")
-        views = [CameraView(view) if isinstance(view, Camera) else view for view in views]
+        views = [view if isinstance(view, CameraView) else CameraView(view) for view in views]
         for view in views:
             view.check(body)
         self.settings = settings
@@ -330,7 +330,7 @@ class TrackingSession:
         """
         with threads_for(self.plan.engine):
             began = time.perf_counter()
-            given = (images,) if isinstance(images, Image) else tuple(images)
+            given = tuple(images) if isinstance(images, Sequence) else (images,)
             pairs = zip_longest(given, self._observers)
             frames = [self._placed(image, observer) for image, observer in pairs]
             everywhere: ViewWindows = (None,) * len(frames)

@@ -27,7 +27,7 @@ from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine
-from torchcss.errors import ConfigurationError, check_device
+from torchcss.errors import ConfigurationError, check_device, check_range, make_whole
 from torchcss.inference.dynamics import ConstantVelocity, Deviation
 from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.proposals import ChamRehg, Condensation, EigenDirectionGrid
@@ -88,6 +88,7 @@ def named_terms(names: Iterable[str]) -> tuple[str, ...]:
     Args:
         names: Names as a user gives them.
     """
+    names = [names] if isinstance(names, str) else names
     return tuple(dict.fromkeys(term for name in names for term in _SETS.get(name, (name,))))
 
 
@@ -191,6 +192,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "preset", preset_name(self.preset))
+        for name in ("body", "device"):  # a path, a torch.device: as the file of a run holds them
+            object.__setattr__(self, name, str(getattr(self, name)))
         if self.terms is not None:
             object.__setattr__(self, "terms", named_terms(self.terms))
             _check_terms(self.terms)
@@ -221,27 +224,23 @@ class Settings:
 
     def _check_numbers(self) -> None:
         """Numbers lie where they may."""
-        for name, weight in (*self.weights.items(), ("contour_weight", self.contour_weight)):
+        for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
-                where = f"weights: {name}" if name in self.weights else name
-                raise ConfigurationError(f"{where} must be at least 0 and finite, got {weight}")
-        if not 0 <= self.boundary_emphasis <= 1:
-            raise ConfigurationError(
-                f"boundary_emphasis must lie in 0..1, got {self.boundary_emphasis}"
-            )
+                raise ConfigurationError(
+                    f"weights: {name} must be at least 0 and finite, got {weight}"
+                )
+        counts = ("samples", "modes", "working_size", "oversampling", "threads")
+        make_whole(self, "seed", "limb_jumps", *counts)
         check_seed(self.seed)
-        for name in ("samples", "modes", "working_size", "oversampling", "threads"):
-            number = getattr(self, name)
-            if number is not None and number < 1:
-                raise ConfigurationError(f"{name} must be at least 1, got {number}")
+        check_range(self, *counts, least=1)
+        check_range(self, "contour_weight", "limb_jumps")
+        check_range(self, "boundary_emphasis", most=1)
         if self.likelihood_power is not None and not 0 < self.likelihood_power <= 1:
             raise ConfigurationError(
                 f"likelihood_power must lie above 0 and at most at 1, got {self.likelihood_power}"
             )
         if self.ground is not None and not math.isfinite(self.ground):
             raise ConfigurationError(f"ground must be finite, metres, got {self.ground}")
-        if self.limb_jumps < 0:
-            raise ConfigurationError(f"limb_jumps must be at least 0, got {self.limb_jumps}")
 
     @property
     def used_terms(self) -> tuple[str, ...]:

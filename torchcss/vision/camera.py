@@ -51,7 +51,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from torchcss.errors import CameraError, check_shape
+from torchcss.errors import CameraError, check_floating, check_shape
 from torchcss.types import PointCost
 from torchcss.vision.sampling import inside_image
 
@@ -188,7 +188,7 @@ class Camera(nn.Module):
                 f"{list(coefficients.shape)}; for another lens model undistort the video first"
             )
         rotation = _finite_tensor(
-            name, "R_camera_world", torch.eye(3) if R_camera_world is None else R_camera_world, 3, 3
+            name, "R_camera_world", np.eye(3) if R_camera_world is None else R_camera_world, 3, 3
         )
         translation = _finite_tensor(
             name, "t_camera_world", [0.0] * 3 if t_camera_world is None else t_camera_world, 3
@@ -202,6 +202,7 @@ class Camera(nn.Module):
         self.register_buffer("R_camera_world", _nearest_rotation(name, rotation))
         self.register_buffer("t_camera_world", translation)
         self.register_buffer("maximum_radius", _monotonic_radius(coefficients))
+        self.register_load_state_dict_post_hook(_see_distortion)
 
     @classmethod
     def pinhole(
@@ -275,6 +276,7 @@ class Camera(nn.Module):
     def to_camera_frame(self, points_world: Vectors) -> Vectors:
         """Return the points in the camera's frame, `R x + t`, metres."""
         check_shape("points_world", points_world, 3)
+        check_floating("points_world", points_world)
         translation = self.t_camera_world.to(points_world)
         return _turned(self.R_camera_world, points_world) + translation
 
@@ -285,7 +287,7 @@ class Camera(nn.Module):
             points_world: World frame, metres.
 
         Raises:
-            ShapeError: If the last dimension is not 3.
+            ShapeError: If the last dimension is not 3, or the points are of no floating type.
         """
         return Projection(*self.project_with_derivatives(points_world)[:3])
 
@@ -296,7 +298,7 @@ class Camera(nn.Module):
             points_world: World frame, metres.
 
         Raises:
-            ShapeError: If the last dimension is not 3.
+            ShapeError: If the last dimension is not 3, or the points are of no floating type.
         """
         a, b, inverse_depth, depth, valid = self._normalise(points_world)
         if self.has_distortion:
@@ -420,9 +422,10 @@ class Camera(nn.Module):
             where it does not, the coordinates are the nearest found within the monotonic region.
 
         Raises:
-            ShapeError: If the last dimension is not 2.
+            ShapeError: If the last dimension of `uv` is not 2, or it is of no floating type.
         """
         check_shape("uv", uv, 2)
+        check_floating("uv", uv)
         K = self.K.to(uv)
         focal = torch.diagonal(K)[:2]
         target = (uv - K[:2, 2]) / focal
@@ -468,7 +471,7 @@ class Camera(nn.Module):
             uv: Pixel coordinates.
 
         Raises:
-            ShapeError: If the last dimension is not 2.
+            ShapeError: If the last dimension of `uv` is not 2, or it is of no floating type.
         """
         direction = self._at_unit_depth(uv)
         direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
@@ -482,7 +485,7 @@ class Camera(nn.Module):
             depth: Distance along the optical axis, as `project` returns it.
 
         Raises:
-            ShapeError: If the last dimension of `uv` is not 2.
+            ShapeError: If the last dimension of `uv` is not 2, or it is of no floating type.
         """
         point = self._at_unit_depth(uv) * depth[..., None] - self.t_camera_world.to(uv)
         return point @ self.R_camera_world.to(uv)
@@ -589,6 +592,10 @@ class Camera(nn.Module):
         v = torch.where(valid, K[1, 1] * b + K[1, 2], -float(height))
         # Each coordinate one block in memory, as everything that is computed from points.
         return torch.stack([u, v]).movedim(0, -1)
+
+
+def _see_distortion(camera: Camera, _keys: object) -> None:
+    camera.has_distortion = bool((camera.distortion != 0).any())
 
 
 def _turned(rotation: Tensor, vectors: Vectors) -> Vectors:
@@ -712,7 +719,7 @@ def _checked_image_size(name: str, image_size_wh: Sequence[int]) -> tuple[int, i
 
 def _finite_tensor(name: str, what: str, value: object, *shape: int) -> Tensor:
     """Copy a value into a float64 tensor on the CPU and check it."""
-    array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
+    array = value.detach().cpu().double().numpy() if isinstance(value, Tensor) else value
     try:
         tensor = torch.from_numpy(np.array(array, dtype=np.float64))
     except (TypeError, ValueError) as error:

@@ -204,8 +204,9 @@ class FeatureExtractor(nn.Module):
         self.flow = flow
         self.working_size = working_size
         self.colour = colour
-        # Rec. 601, the weights of video decoders.
-        self.register_buffer("luma", torch.tensor([0.299, 0.587, 0.114]), persistent=False)
+        # Rec. 601, the weights of video decoders; single precision, whatever torch's default is.
+        luma = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float32)
+        self.register_buffer("luma", luma, persistent=False)
 
     def working_shape(self, width: int, height: int) -> tuple[int, int]:
         """Return the width and height of the features of a frame of the given size."""

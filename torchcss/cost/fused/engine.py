@@ -172,11 +172,16 @@ class FusedEngine:
     """
 
     def __init__(self, dtype: Literal["float32", "float64"] = "float32", threads: int = 1) -> None:
+        self._made_of = dtype, threads
         self.real: Any = np.float32 if dtype == "float32" else np.float64
         self._views, self._priors, self._bodies = _Packs(), _Packs(), _Packs()
         self._workspaces: dict[tuple[int, ...], Workspaces] = {}
         self._threads = threads
         self._helpers: dict[int, ThreadPoolExecutor] = {}  # by process: a fork has no threads
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied and pickled as what made it: what it has packed stays in its process."""
+        return fused_engine, self._made_of
 
     def value(self, cost: TrackingCost, x: States) -> Costs:
         """Cost in nats; see `TrackingCost.value`."""
