@@ -2142,3 +2142,38 @@ def test_points_of_openpose_in_a_long_table(tmp_path: Path) -> None:
     above = [["joint", *np.repeat(TFJS, 3)], ["coord", *("x", "y", "conf") * 17], ["frame"]]
     text = "\n".join(",".join(map(str, row)) for row in [*above, *([t, *flat(t)] for t in T)])
     check(read(write(tmp_path / "b.csv", text)))
+
+
+def test_depths_are_no_confidences(tmp_path: Path) -> None:
+    rows = np.stack([person(t) for t in T])
+    rows[..., 2] = np.linspace(-40.0, 30.0, len(COCO))
+    rows[3] = 0
+    np.save(tmp_path / "a.npy", rows)
+    found = read(tmp_path / "a.npy")
+    check(found, (3,))
+    assert "no confidence in the file, but z: 1 for every joint" in found.report
+
+
+def test_a_box_beside_numbered_joints(tmp_path: Path) -> None:
+    heads = [f"kpt_{n}_{kind}" for n in range(len(COCO)) for kind in ("x", "y", "conf")]
+    rows = [[t, 1, 10, 20, 30, 40, 0.9, *flat(t)] for t in T]
+    text = wide(["frame", "id", "x1", "y1", "x2", "y2", "conf", *heads], rows)
+    check(read(write(tmp_path / "a.csv", text)))
+
+
+@pytest.mark.parametrize("word", ["coordinate", "position"])
+def test_places_of_joints_by_another_word(tmp_path: Path, word: str) -> None:
+    """The samples of TensorFlow Lite for Android and iOS."""
+    frames = [{"frame": t, "persons": [{"id": 3, "keyPoints": [
+        {"bodyPart": name.upper(), word: {"x": x, "y": y} if word == "coordinate" else [x, y],
+         "score": c} for name, (x, y, c) in zip(TFJS, person(t), strict=True)
+    ]}]} for t in T]  # fmt: skip
+    found = read(write(tmp_path / "a.json", frames))
+    check(found)
+    assert float(found.confidence[0, 0]) == pytest.approx(0.6)
+
+
+def test_frames_by_number_of_pictures_that_have_names(tmp_path: Path) -> None:
+    images = [{"id": t, "frame_id": 7 + t, "file_name": f"{'acbfed'[t]}.jpg"} for t in T]
+    marks = [{"image_id": t, "keypoints": flat(t)} for t in T]
+    check(read(write(tmp_path / "a.json", {"images": images, "annotations": marks})))

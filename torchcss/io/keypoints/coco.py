@@ -21,7 +21,7 @@ from torchcss.io.keypoints.people import (
     one_size,
     track_of,
 )
-from torchcss.io.keypoints.words import TRACKS
+from torchcss.io.keypoints.words import FRAMES, TRACKS, first_of
 from torchcss.io.video import natural_order
 from torchcss.joint_names import canonical_joint_name
 
@@ -85,9 +85,12 @@ def _by_images(
 ) -> tuple[Frames, tuple[float, float] | None]:
     """People by the names of their pictures, and the size that all of these have."""
     names: dict[Key, str] = {}
+    numbers: dict[Key, int] = {}
     for image in listed(images):
         if isinstance(image, dict) and (own := _identifier(image.get("id"))) is not None:
             names[own] = str(image.get("file_name", own))
+            if type(number := first_of(image, FRAMES)) is int:
+                numbers[own] = number
     if not isinstance(images, list) or len(set(names.values())) < len(images):
         raise KeypointError(
             "expected 'images' to be a list with an id and file_name of their own each"
@@ -95,5 +98,7 @@ def _by_images(
     if unknown := [image for image in found if image not in names]:
         raise KeypointError(f"detection of image {unknown[0]!r}, which is not in 'images'")
     ordered = sorted(names, key=lambda image: natural_order(names[image]))
+    if len({*numbers.values()}) == len(names):
+        ordered.sort(key=numbers.__getitem__)
     frames: Frames = {names[image]: found.get(image, []) for image in ordered}
     return frames, one_size({said_size(image) for image in images})

@@ -37,7 +37,7 @@ from torchcss.io.keypoints.json_people import (
     said_size,
     scored,
 )
-from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered, without_depth
+from torchcss.io.keypoints.mediapipe import LAYOUT, NUM_LANDMARKS, reordered
 from torchcss.io.keypoints.people import (
     Frames,
     Key,
@@ -180,7 +180,6 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
     report, layout = [f"format: {name}"], None
     if names is None and NUM_LANDMARKS in joint_counts(frames):
         report, layout = ["format: MediaPipe landmarks"], LAYOUT
-        frames = without_depth(frames, report)
     found = list(frames.values()) if in_order else frames
     return People(found, names, report, layout, corner_fractions=layout == LAYOUT)
 

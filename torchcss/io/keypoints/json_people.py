@@ -55,6 +55,9 @@ _AXES = tuple(
 )
 """What the coordinates of a joint are called; pixels come before points in space (Kinect)."""
 
+_PLACES = names_in("position coordinate coordinates point location")
+"""What both together are called."""
+
 _BOX = frozenset(names_in("x left x1 xmin"))
 """What has a word of these has the size of a box."""
 
@@ -169,10 +172,18 @@ def is_joints(value: list[Any]) -> bool:
         key = key_of(first, JOINTS)  # of a person, who may have a box with x and y
         if key is not None and isinstance(first[key], (list, dict)):
             return False
-        return _has_place(first) or "position" in first
+        return _has_place(_place_of(first))
     return (
         isinstance(first, list) and 2 <= len(first) <= 4 and not isinstance(first[0], (list, dict))
     )
+
+
+def _place_of(row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What of a joint has x and y: itself, or its place."""
+    place = first_of(row, _PLACES)
+    if isinstance(place, list) and len(place) == 2:
+        return dict(zip("xy", place, strict=True))
+    return place if isinstance(place, dict) else row
 
 
 def _has_place(entry: Mapping[str, Any]) -> bool:
@@ -284,8 +295,8 @@ def _row(where: str, row: Any) -> list[float]:
     if row is None:
         return [np.nan] * 3
     if isinstance(row, dict):
-        place = row.get("position", row)
-        if not isinstance(place, dict) or not _has_place(place):
+        place = _place_of(row)
+        if not _has_place(place):
             raise unexpected(KeypointError, where, "x, y and visibility", row)
         given = first_of(row, CONFIDENCES)
         x, y = (first_of(place, words) for words in _AXES)

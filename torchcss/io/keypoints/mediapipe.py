@@ -19,7 +19,6 @@ from torchcss.io.keypoints.people import (
     Frames,
     Names,
     joint_counts,
-    screened,
 )
 from torchcss.joint_names import ALIASES, CASE, names_in
 
@@ -98,23 +97,6 @@ def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
             joints[place] = person.joints
             found[key].append(person._replace(joints=joints))
     return found
-
-
-def without_depth(frames: Frames, report: list[str]) -> Frames:
-    """The people, with confidence 1 where their third numbers are z: below 0 before the hips.
-
-    Args:
-        frames: The people, of 33 joints each.
-        report: Gets a line if they were z.
-    """
-    everyone = [person.joints for people in frames.values() for person in people]
-    if not any((joints[:, 2] < 0).any() for joints in everyone):
-        return frames
-    report.append("no confidence in the file, but z: 1 for every joint")
-    return {
-        key: [person._replace(joints=screened(person.joints[:, :2])) for person in people]
-        for key, people in frames.items()
-    }
 
 
 def check_not_in_space(frames: Sequence[np.ndarray]) -> None:

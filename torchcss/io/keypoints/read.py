@@ -61,7 +61,7 @@ from torchcss.io.keypoints.links import Links, joints_named, names_links
 from torchcss.io.keypoints.mediapipe import LAYOUT as LANDMARKS
 from torchcss.io.keypoints.mediapipe import check_not_in_space
 from torchcss.io.keypoints.one_person import Whom, follow_person, size_of
-from torchcss.io.keypoints.people import Names, People, Person, Size, is_there
+from torchcss.io.keypoints.people import Names, People, Person, Size, is_there, screened
 from torchcss.io.keypoints.sides import with_sides_put_back
 from torchcss.io.keypoints.tables import json_of_rows, people_of_rows, table_rows
 from torchcss.io.video import VIDEO_SUFFIXES
@@ -111,6 +111,9 @@ _LARGEST_FRACTION = 3.0
 
 _PERCENT = 50.0
 """Confidences that run to more than this, to 100 at most, and mostly above 1, are percent."""
+
+_DEPTHS = 0.1
+"""Share of third numbers below 0 from which they are z, as MediaPipe's, and no confidences."""
 
 _OUTSIDE = 3.0
 """How many times the longer image side a joint may lie outside before the file is refused."""
@@ -358,6 +361,9 @@ def _checked_numbers(
     elif _PERCENT < most <= 100.0 and np.median(counts[counts > 0.0]) > 1.0:
         report.append(f"confidences run to {most:g}: they are taken for percent")
         frames = [frame * (1.0, 1.0, 0.01) for frame in frames]
+    elif ((counts < 0) & (counts != -1)).sum() > _DEPTHS * len(counts):
+        report.append("no confidence in the file, but z: 1 for every joint")
+        frames = [screened(frame[..., :2]) for frame in frames]
     for index, frame in enumerate(frames):
         if not len(frame):  # most of them, of a file of few pictures
             checked.append(frame)

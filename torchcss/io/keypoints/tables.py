@@ -373,9 +373,12 @@ def _headed(heading: Sequence[str]) -> _Columns:
     if not any(each is not None and each[1] == 1 for each in split):  # u and v
         split = [_split(cell, {**_PARTS, "v": 1}) for cell in heading]
     columns: dict[tuple[str, str], dict[int, int]] = {}
-    # Pixels before fractions, and the better of two confidences, where a table has both.
+    # Pixels before fractions, points before a box, and the better of two confidences.
     there = {index: each for index, each in enumerate(split) if each is not None}
-    ranks = [1 - bool(_PIXELS.search(cell)) + bool(_FRACTIONS.search(cell)) for cell in heading]
+    ranks = [
+        1 - bool(_PIXELS.search(c)) + bool(_FRACTIONS.search(c)) - 3 * bool(re.match(_POINTS, c))
+        for c in map(str.lower, heading)
+    ]
     rank = {index: (ranks[index], each[2]) for index, each in there.items()}
     for index in sorted(there, key=rank.__getitem__):
         name, part, _ = there[index]
