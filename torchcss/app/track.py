@@ -34,6 +34,7 @@ from torchcss.errors import (
     OutputError,
     TrackFileError,
     check_positive,
+    check_range,
 )
 from torchcss.files import StrPath, make_paths, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
@@ -110,10 +111,7 @@ class TrackOptions:
     def __post_init__(self) -> None:
         make_paths(self)
         check_positive(self, "sigma", finite=True)
-        if not self.checkpoint_every >= 0:
-            raise ConfigurationError(
-                f"checkpoint_every must be at least 0 seconds, got {self.checkpoint_every}"
-            )
+        check_range(self, "checkpoint_every", hint=" seconds", finite=False)
 
 
 def track_video(

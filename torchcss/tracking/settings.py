@@ -226,9 +226,7 @@ class Settings:
         """Numbers lie where they may."""
         for name, weight in self.weights.items():
             if not 0 <= weight < math.inf:
-                raise ConfigurationError(
-                    f"weights: {name} must be at least 0 and finite, got {weight}"
-                )
+                raise ConfigurationError(f"weights: {name}: expected 0 or more, got {weight}")
         counts = ("samples", "modes", "working_size", "oversampling", "threads")
         make_whole(self, "seed", "limb_jumps", *counts)
         check_seed(self.seed)
