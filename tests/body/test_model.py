@@ -207,6 +207,15 @@ def test_a_mesh_of_inference_mode_is_not_kept() -> None:
     assert bool(slope.any())
 
 
+def test_a_surface_is_compiled_in_one_graph() -> None:
+    body = load_body("arm8")
+    x = body.rest[None]
+    points = torch.compile(
+        lambda x: body.surface(body.pose(x)).points, backend="eager", fullgraph=True
+    )
+    assert torch.equal(points(x), body.surface(body.pose(x)).points)
+
+
 def test_another_base_moves_the_whole_body(generator: torch.Generator) -> None:
     body = load_body("body34")
     x = random_states(body, 2, generator=generator)

@@ -342,7 +342,8 @@ class BodyModel(nn.Module):
         eta, omega = angular_grid(rings, meridians, dtype=self.dtype, device=shape.device)
         full = (self.num_parts, *eta.shape)
         mesh = surface_points(shape[:, None, None, :], eta.expand(full), omega.expand(full))
-        if not (shape.requires_grad or mesh.points.is_inference()):
+        # Dynamo cannot trace the question whether it is of inference mode.
+        if not (shape.requires_grad or torch.compiler.is_compiling() or mesh.points.is_inference()):
             self._meshes[size] = shape, mesh
         return mesh
 

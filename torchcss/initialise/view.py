@@ -72,8 +72,7 @@ class CameraView(NamedTuple):
             body: The body.
 
         Raises:
-            ConfigurationError: If their noise is no number of pixels, or camera or keypoints are
-                something else.
+            ConfigurationError: If their noise is no number, or the view is not of these types.
             ShapeError: If they are no tensors of a floating type, or not pairs of a joint each.
             KeypointError: If they are not those of all frames, or of none of the body's joints.
         """
