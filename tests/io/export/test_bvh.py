@@ -240,3 +240,16 @@ def test_written_and_loaded(tmp_path: Path):
     assert done.paths == (tmp_path / "track.bvh",)
     other = export_as(track, to="bvh", out=tmp_path / "memory.bvh")
     assert done.paths[0].read_bytes() == other.paths[0].read_bytes()
+
+
+def test_blanks_in_names_become_underscores(tmp_path: Path):
+    """Biped's names have them; some readers end a name there, so that two joints have one name."""
+    source = tmp_path / "biped.bvh"
+    channels = "CHANNELS 3 Zrotation Xrotation Yrotation\nEnd Site\n{\nOFFSET 0 80 0\n}\n"
+    source.write_text(
+        "HIERARCHY\nROOT Bip01\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition "
+        "Zrotation Xrotation Yrotation\nJOINT Bip01 Tail\n{\nOFFSET 0 80 0\n"
+        f"{channels}}}\n}}\nMOTION\nFrames: 1\nFrame Time: 0.1\n" + "0 " * 9 + "\n"
+    )
+    done = export_as(make_track(load_body(source)), "bvh", tmp_path / "out")
+    assert "JOINT Bip01_Tail\n" in done.paths[0].read_text()

@@ -159,6 +159,20 @@ def test_c3d(tmp_path: Path, frame: str | None, screen: tuple[str, str], turn: n
         assert np.isnan(file.points[~present]).all()
 
 
+def test_blanks_in_names_part_no_columns():
+    """Some readers of TRC and OpenSim's of MOT part columns at blanks, which Biped's names have."""
+    names = ("Bip01 L Hand", "Bip01 Spine")
+    assert trc_header("a.trc", names, 1, 30.0, 0).split("\n")[3].split()[2:] == [
+        "Bip01_L_Hand",
+        "Bip01_Spine",
+    ]
+    assert mot_header(("time", *names), 1).split("\n")[-2].split() == [
+        "time",
+        "Bip01_L_Hand",
+        "Bip01_Spine",
+    ]
+
+
 def test_c3d_refuses_places_that_its_numbers_cannot_tell_apart(tmp_path: Path):
     """At 4200 km from the origin, as in UTM coordinates, single precision has steps of 0.5 m."""
     track = make_track(body_named("arm7"))

@@ -6,6 +6,7 @@ The dialect is that of the motion-capture libraries: a `ROOT` of six channels (p
 +Z, left is +X, as in our bodies and in Blender's reader.
 
 Landmarks are joints of zero turns, so that every joint of ours is in the file under its name.
+Blanks in names become underscores: some readers end a name at the first one.
 
 Call `bvh_text`.
 """
@@ -138,7 +139,8 @@ def _hierarchy(
         kind, channels = "JOINT", f"3 {turns}"
         if index == 0:
             kind, channels = "ROOT", f"6 Xposition Yposition Zposition {turns}"
-        lines.extend([f"{tabs}{kind} {skeleton.names[index]}", f"{tabs}{{"])
+        name = skeleton.names[index].replace(" ", "_")
+        lines.extend([f"{tabs}{kind} {name}", f"{tabs}{{"])
         offset = " ".join(_number(value, decimals) for value in offsets[index])
         lines.extend([f"{tabs}\tOFFSET {offset}", f"{tabs}\tCHANNELS {channels}"])
         children = [child for child, parent in enumerate(skeleton.parents) if parent == index]

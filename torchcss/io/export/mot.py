@@ -2,9 +2,9 @@
 
 The header and the columns' width are byte for byte those that OpenSim writes. The coordinates are
 the parameters of our body by our names, turns in degrees, lengths in metres; a model of OpenSim's
-that has other coordinates does not take them as they are. The root stands in the file's frame,
-whatever base the track hung it on: yaw about Y, pitch about X, roll about Z, each axis turned by
-those before.
+that has other coordinates does not take them as they are. Blanks in names become underscores:
+OpenSim parts columns at them. The root stands in the file's frame, whatever base the track hung it
+on: yaw about Y, pitch about X, roll about Z, each axis turned by those before.
 
 Call `mot_text`.
 """
@@ -41,7 +41,7 @@ def mot_header(columns: Sequence[str], num_rows: int) -> str:
         "values are in degrees (yes) or radians (no).",
         "",
         "endheader",
-        "\t".join(columns),
+        "\t".join(name.replace(" ", "_") for name in columns),
     ]
     return "\n".join(lines) + "\n"
 

@@ -2,7 +2,8 @@ r"""TRC: the joints as markers, for OpenSim and Vicon's relatives.
 
 The header is byte for byte that of Pose2Sim's files, which OpenSim reads: tabs, a line end of `\n`,
 marker names in every third column, no blank line before the data, frames counted from 1. Metres. A
-marker that a frame lacks is three empty cells.
+marker that a frame lacks is three empty cells. Blanks in names, as a BVH file's joints may have,
+become underscores: some readers part columns at blanks.
 
 Call `trc_text`.
 """
@@ -35,7 +36,7 @@ def trc_header(
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\t"
         "OrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
         f"{hertz}\t{hertz}\t{num_frames}\t{len(names)}\tm\t{hertz}\t{first_frame}\t{num_frames}",
-        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
+        "Frame#\tTime\t" + "\t\t\t".join(name.replace(" ", "_") for name in names) + "\t\t",
         "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in numbers),
     ]
     return "\n".join(lines) + "\n"
