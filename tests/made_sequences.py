@@ -68,8 +68,7 @@ def write_arm(folder: Path, num_frames: int) -> SyntheticSequence:
         folder / "reference3d.npz", joints=joints.numpy(), joint_names=names, units=np.array("m")
     )
     np.savez(folder / "mask.npz", mask=np.stack([silhouette(body, x, camera) for x in made.states]))
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
+    base = body.base_transform.numpy()
     np.savez(
         folder / "truth.npz",
         body=np.array(body.name), lengths=np.array(json.dumps(body.lengths)), base_transform=base,

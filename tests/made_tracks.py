@@ -34,12 +34,11 @@ def modes_at(
 ) -> FrameModes:  # fmt: skip
     """Modes of a frame at states `[k n]` of a body on its base; alike unless changed."""
     k, n = state.shape
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
     alike = {"log_weight": torch.zeros(k), "cost": torch.zeros(k), "parent": torch.full((k,), -1)}
     return FrameModes(
         frame=frame, time_s=frame / rate, state=state, covariance=covariance.expand(k, n, n),
-        joints_world=body.pose(state).joints, base_transform=base, **{**alike, **changes},
+        joints_world=body.pose(state).joints, base_transform=body.base_transform.double(),
+        **{**alike, **changes},
     )  # fmt: skip
 
 

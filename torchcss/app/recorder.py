@@ -257,10 +257,9 @@ OF_A_TRACK = re.compile(r"smooth\.npz|overlay(_[0-9]+)?\.mp4|(smooth_)?report\.h
 
 def modes_of(frame: Posterior, *, is_first: bool = False) -> FrameModes:
     """A frame as the track takes it."""
-    base = torch.eye(4, dtype=torch.float64)
-    base[:3, :3], base[:3, 3] = frame.body.base_rotation, frame.body.base_translation
     mixture, parent = frame.state.mixture, frame.info.parent
     numbers = {
+        "base_transform": frame.body.base_transform,
         "state": mixture.mean,
         "covariance": frame.covariance,
         "log_weight": mixture.log_weight,
@@ -271,7 +270,6 @@ def modes_of(frame: Posterior, *, is_first: bool = False) -> FrameModes:
     return FrameModes(
         frame=frame.frame.index,
         time_s=frame.frame.time_s,
-        base_transform=base,
         **{name: tensor.detach().double().cpu() for name, tensor in numbers.items()},
     )
 

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchcss.body.rotations import frame_at
 from torchcss.errors import BodyError
 from torchcss.types import frozen
 
@@ -130,10 +131,7 @@ def link_poses(chain: Chain, q: Float[Tensor, "*batch q"]) -> Float[Tensor, "*ba
 def offset_matrix(joint: JointSpecification) -> Float[np.ndarray, "4 4"]:
     """Where a joint sits in the link above, its rotation made orthonormal."""
     left, _, right = np.linalg.svd(np.asarray(joint.rotation, dtype=np.float64))
-    matrix = np.eye(4)
-    matrix[:3, :3] = left @ right
-    matrix[:3, 3] = joint.translation
-    return matrix
+    return frame_at(left @ right, joint.translation)
 
 
 def check_joints(joints: Sequence[JointSpecification]) -> None:

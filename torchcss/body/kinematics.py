@@ -34,7 +34,7 @@ from torchcss.body.chain import (
     make_chain,
     offset_matrix,
 )
-from torchcss.body.rotations import frame_along
+from torchcss.body.rotations import frame_along, frame_at
 from torchcss.errors import BodyError, check_shape
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
@@ -136,8 +136,7 @@ class KinematicTree(nn.Module):
             if joint.kind == "fixed":
                 carrier[joint.link], fixed[joint.link] = above, offset
                 continue
-            aligned = np.eye(4)
-            aligned[:3, :3] = frame_along(joint.axis)
+            aligned = frame_at(frame_along(joint.axis), np.zeros(3))
             carrier[joint.link], fixed[joint.link] = joint.name, aligned.T
             parent[joint.name], constant[joint.name] = above, offset @ aligned
             depth[joint.name] = 1 if above is None else depth[above] + 1

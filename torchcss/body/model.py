@@ -250,6 +250,13 @@ class BodyModel(nn.Module):
                 "with body.to(x.dtype)"
             )
 
+    @property
+    def base_transform(self) -> Float[Tensor, "4 4"]:
+        """World from the root link's frame."""
+        base = torch.eye(4).to(self.base_rotation)
+        base[:3, :3], base[:3, 3] = self.base_rotation, self.base_translation
+        return base
+
     def with_base(
         self, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]
     ) -> BodyModel:
@@ -283,9 +290,8 @@ class BodyModel(nn.Module):
         """
         check_shape("x", x, self.num_parameters)
         check_floating("x", x)
-        base = torch.eye(4, dtype=x.dtype, device=x.device)
-        base[:3, :3], base[:3, 3] = self.base_rotation.to(x), self.base_translation.to(x)
-        return base @ self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x))
+        poses = self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x))
+        return self.base_transform.to(x) @ poses
 
     def pose(self, x: Float[Tensor, "*batch n"]) -> BodyPose:
         """Pose the body for the evaluation of a cost: the map A of eq. 1 [IJRR].

@@ -10,6 +10,7 @@
 | `within_half_turn` | angles that differ by whole turns |
 | `check_rotation` | matrices that users give |
 | `frame_along` | a frame whose z axis has a direction |
+| `frame_at` | a rotation and a place in one matrix |
 | `as_vector`, `as_rows` | plain numbers, as specifications hold them |
 """
 
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, check_floating, check_shape
@@ -203,6 +205,13 @@ def root_angles(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     pitch = torch.asin((-rotation[..., 1, 2]).clamp(-1, 1))
     roll = torch.atan2(rotation[..., 1, 0], rotation[..., 1, 1])
     return torch.stack([yaw, pitch, roll], dim=-1)
+
+
+def frame_at(rotation: ArrayLike, place: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    """A rotation and a place in one matrix."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, place
+    return pose
 
 
 def as_vector(values: Float[np.ndarray, "3"]) -> Vector3:

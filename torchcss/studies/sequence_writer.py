@@ -153,12 +153,10 @@ def write_camera(path: Path, camera: Camera) -> None:
 def write_motion(path: Path, motion: Motion, more: Mapping[str, Any]) -> None:
     """Write a motion file, see `torchcss.studies.sequences`, with some more arrays."""
     body = motion.body
-    base = np.eye(4)
-    base[:3, :3], base[:3, 3] = body.base_rotation, body.base_translation
     known = {
         "body": body.name,
         "lengths": json.dumps(body.lengths),
-        "base_transform": base,
+        "base_transform": body.base_transform.double(),
         "state_names": body.state_names,
         "states": motion.states,
         "frame_rate": motion.frame_rate,

@@ -26,7 +26,7 @@ from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification, without_side
 from torchcss.body.chain import JointSpecification
-from torchcss.body.rotations import Vector3, as_rows, as_vector, frame_along
+from torchcss.body.rotations import as_rows, as_vector, frame_along, frame_at
 from torchcss.body.surface import angular_grid, implicit, surface_points
 
 GIRTHS: dict[tuple[str, str], tuple[str, float]] = {
@@ -84,15 +84,9 @@ def rest_poses(joints: Sequence[JointSpecification]) -> dict[str, Float[np.ndarr
     """Pose of every link with all joints at zero, in the root link's frame."""
     poses: dict[str, np.ndarray] = {}
     for joint in joints:
-        local = _frame(joint.rotation, joint.translation)
+        local = frame_at(joint.rotation, joint.translation)
         poses[joint.link] = local if joint.parent is None else poses[joint.parent] @ local
     return poses
-
-
-def _frame(rotation: Sequence[Sequence[float]], place: Vector3) -> Float[np.ndarray, "4 4"]:
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = rotation, place
-    return frame
 
 
 def bone_parts(
@@ -187,7 +181,7 @@ def touching_parts(
     poses = rest_poses(joints)
     shapes = torch.tensor([part.shape for part in parts], dtype=torch.float64).reshape(-1, 9)
     frames = torch.from_numpy(
-        np.array([poses[part.link] @ _frame(part.rotation, part.translation) for part in parts])
+        np.array([poses[part.link] @ frame_at(part.rotation, part.translation) for part in parts])
     ).reshape(-1, 4, 4)
     turn, centre = frames[:, :3, :3], frames[:, :3, 3]
     eta, omega = (
