@@ -113,6 +113,7 @@ _PAGE = """<!DOCTYPE html>
 body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; padding: 1rem; }}
 th, td {{ text-align: left; vertical-align: top; padding: .2rem .8rem .2rem 0;
   overflow-wrap: break-word; }}
+td:last-child {{ overflow-wrap: anywhere; }}
 th {{ border-bottom: 1px solid #ddd; }}
 </style></head><body>
 <h1>{summed}</h1>
