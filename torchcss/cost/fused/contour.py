@@ -37,9 +37,7 @@ def compare_outline(
     """
     count = _look(nodes, lens, workspace.seen)
     if edges.scale > 0.0:
-        match_edges(
-            edges, workspace.seen, count, (workspace.response, workspace.maxima), workspace.peaks
-        )
+        match_edges(edges, workspace.seen, count, workspace.response, workspace.peaks)
     if colours.scale > 0.0:
         match_colours(colours, workspace.seen, count)
     _pull_back(nodes, lens, workspace.seen, count, exact, workspace.points)

@@ -15,28 +15,27 @@ _FADE = 0.25
 
 
 @kernel
-def match_edges(
-    edges: Edges, seen: Seen, count: int, workspace: tuple[Array, Array], peaks: Peaks
-) -> None:
+def match_edges(edges: Edges, seen: Seen, count: int, response: Array, peaks: Peaks) -> None:
     """Add what the nodes gain by their wells, eq. 8 [IJRR], and the derivatives.
 
     Args:
         edges: The term.
         seen: The nodes in the image.
         count: Their number.
-        workspace: Memory for the response at each step, and for the places of its maxima.
-        peaks: Memory for the maxima of all nodes.
+        response: Memory for the response along the lines of all nodes, one after the other.
+        peaks: Memory for its maxima.
     """
-    total = 0
+    total, size = 0, len(edges.steps)
     for k in range(count):
         seen.first[k] = total
-        _respond(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), workspace[0])
-        total = _collect(edges, workspace[0], workspace[1], peaks, total)
+        line = response[k * size : (k + 1) * size]
+        _respond(edges, (seen.u[k], seen.v[k]), (seen.mu[k], seen.mv[k]), line)
+        total = _find_maxima(edges, line, k * size, peaks, total)
     seen.first[count] = total
     if edges.assignment == 0:
-        _weigh(edges, peaks, total)
+        _weigh(edges, response, peaks, total)
     else:
-        _add_up(edges, seen, count, peaks)
+        _add_up(edges, seen, count, response, peaks)
     for k in range(count):
         share = well = slope = curvature = edges.scale * 0.0
         for n in range(seen.first[k], seen.first[k + 1]):
@@ -78,30 +77,25 @@ def _respond(
 
 
 @kernel
-def _collect(edges: Edges, response: Array, maxima: Array, peaks: Peaks, total: int) -> int:
-    """Add the maxima on a line to the list; its new length."""
-    count = 0
-    for m in range(2, len(response) - 2):
-        maxima[count] = m
-        rises, falls = response[m] > response[m - 1], response[m + 1] > response[m]
-        count += int(rises) & int(not falls)  # without a branch, which would be a guess
-    for k in range(count):
-        m, n = maxima[k], total + k
-        peaks.place[n], peaks.middle[n] = edges.steps[m], response[m]
-        peaks.before[n], peaks.left[n] = response[m - 2], response[m - 1]
-        peaks.right[n], peaks.after[n] = response[m + 1], response[m + 2]
-    return total + count
+def _find_maxima(edges: Edges, line: Array, start: int, peaks: Peaks, total: int) -> int:
+    """Add the maxima on a line, which starts at a sample, to the list; its new length."""
+    for m in range(2, len(line) - 2):
+        peaks.sample[total], peaks.place[total] = start + m, edges.steps[m]
+        rises, falls = line[m] > line[m - 1], line[m + 1] > line[m]
+        total += int(rises) & int(not falls)  # without a branch, which would be a guess
+    return total
 
 
 @kernel
-def _weigh(edges: Edges, peaks: Peaks, total: int) -> None:
+def _weigh(edges: Edges, response: Array, peaks: Peaks, total: int) -> None:
     """Weights of all edges, and their wells with derivatives along the normal."""
     reach = 1.5 * edges.step
     sharp = 2.0 / (reach * reach * _SHARP_ENOUGH)
     fade = 1.0 / (_FADE * edges.window)
     for n in range(total):
-        left, middle, right = peaks.left[n], peaks.middle[n], peaks.right[n]
-        before, after = peaks.before[n], peaks.after[n]
+        i = peaks.sample[n]
+        left, middle, right = response[i - 1], response[i], response[i + 1]
+        before, after = response[i - 2], response[i + 2]
         shift, height = _top(before, left, middle, right, after)
         fall = middle - max(
             left + (0.5 - shift) * (before - left), right + (0.5 + shift) * (after - right)
@@ -131,18 +125,19 @@ def _top(
 
 
 @kernel
-def _add_up(edges: Edges, seen: Seen, count: int, peaks: Peaks) -> None:
+def _add_up(edges: Edges, seen: Seen, count: int, response: Array, peaks: Peaks) -> None:
     """The edges of all nodes as printed: each counts in full, or the nearest alone."""
     for k in range(count):
         begin, end = seen.first[k], seen.first[k + 1]
         number, nearest = 0, edges.window
         for n in range(begin, end):
+            i = peaks.sample[n]
             shift, height = _top(
-                peaks.before[n], peaks.left[n], peaks.middle[n], peaks.right[n], peaks.after[n]
+                response[i - 2], response[i - 1], response[i], response[i + 1], response[i + 2]
             )
             distance = peaks.place[n] + edges.step * shift
             is_edge = (abs(distance) < edges.window) & (height >= edges.least)
-            peaks.place[n], peaks.middle[n] = distance, height
+            peaks.place[n], peaks.height[n] = distance, height
             peaks.weight[n] = 1.0 if is_edge else 0.0
             if is_edge:
                 number, nearest = number + 1, min(nearest, abs(distance))
@@ -180,7 +175,7 @@ def _weight_of(
     """The weight of an edge along a normal, inside rho."""
     distance = peaks.place[n]
     weight = _weight_at(edges, place[0] + distance * normal[0], place[1] + distance * normal[1])
-    return weight * peaks.middle[n] if edges.strength else weight
+    return weight * peaks.height[n] if edges.strength else weight
 
 
 @kernel

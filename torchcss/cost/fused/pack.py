@@ -218,7 +218,9 @@ def pack_edges(term: ContourTerm, bound: OnPoints, context: FrameContext) -> Edg
         scale=bound.scale,
         field=field.movedim(0, -1),
         corner=torch.tensor([width - 1.0, height - 1.0]),
-        steps=term.step * torch.arange(-reach, reach + 1).double(),
+        # In whole eights, which are sampled at once; edges beyond the window count nothing.
+        steps=term.step
+        * torch.arange(-reach, -reach + 8 * math.ceil((2 * reach + 1) / 8)).double(),
         step=term.step,
         window=term.window,
         unmatched=term.unmatched,
@@ -334,10 +336,11 @@ def make_workspace(tree: Tree, curves: Curves, sizes: tuple[int, ...], real: Rea
     nodes = max(outline, num_parts * interior, 1)
 
     def fields(kind: Any, size: int, first: int = 0) -> Any:
-        whole = {"ray": size, "part": size, "node": size, "first": first}
+        # Short numbers: a processor looks up eight at a time by them, of the long ones four.
+        types = {**dict.fromkeys(("ray", "part", "node", "sample"), np.int32), "first": np.int64}
         return kind(
             *(
-                np.zeros(whole[name], np.int64) if name in whole else np.zeros(size, real)
+                np.zeros(first if name == "first" else size, types.get(name, real))
                 for name in kind._fields
             )
         )
@@ -361,8 +364,7 @@ def make_workspace(tree: Tree, curves: Curves, sizes: tuple[int, ...], real: Rea
         points=fields(Points, max(pairs, keypoints), first=num_parts + 1),
         seen=fields(Seen, nodes, first=nodes + 1),
         peaks=fields(Peaks, nodes * (steps // 2)),
-        response=np.zeros(steps, real),
-        maxima=np.zeros(steps, np.int64),
+        response=np.zeros(nodes * steps, real),
     )
 
 

@@ -355,14 +355,13 @@ Attributes:
 """
 
 
-Peaks = namedtuple(
-    "Peaks", "place before left middle right after weight share well slope curvature"
-)
+Peaks = namedtuple("Peaks", "sample place height weight share well slope curvature")
 """Maxima of the edge response along the normals of nodes.
 
 Attributes:
-    place: Distance of the highest sample from the node, pixels.
-    before, left, middle, right, after: That sample's response and those beside it.
+    sample: The highest sample, among those of all lines.
+    place: Its distance from the node, pixels; then that of the maximum.
+    height: The response there, where edges are added up as printed.
     weight: Weight of the edge.
     share: What it takes of the sum of one.
     well, slope, curvature: Its cost below that of no edge, and derivatives along the normal.
@@ -393,7 +392,7 @@ Attributes:
 Workspace = namedtuple(
     "Workspace",
     "frames frame posed reference twists moved sums facing outline interior rays near lines "
-    "points seen peaks response maxima",
+    "points seen peaks response",
 )
 """Memory for what is found of one state on the way; nothing in it is kept.
 
@@ -414,6 +413,5 @@ Attributes:
     points: Points with derivatives.
     seen: Contour nodes in the image.
     peaks: Edges beside them.
-    response: Responses along a search line.
-    maxima: Places of its maxima.
+    response: Responses along the search lines of all nodes.
 """
