@@ -93,7 +93,7 @@ def _weigh(edges: Edges, response: Array, peaks: Peaks, total: int) -> None:
     sharp = 2.0 / (reach * reach * _SHARP_ENOUGH)
     fade = 1.0 / (_FADE * edges.window)
     for n in range(total):
-        i = peaks.sample[n]
+        i = int(peaks.sample[n])
         left, middle, right = response[i - 1], response[i], response[i + 1]
         before, after = response[i - 2], response[i + 2]
         shift, height = _top(before, left, middle, right, after)
@@ -131,7 +131,7 @@ def _add_up(edges: Edges, seen: Seen, count: int, response: Array, peaks: Peaks)
         begin, end = seen.first[k], seen.first[k + 1]
         number, nearest = 0, edges.window
         for n in range(begin, end):
-            i = peaks.sample[n]
+            i = int(peaks.sample[n])
             shift, height = _top(
                 response[i - 2], response[i - 1], response[i], response[i + 1], response[i + 2]
             )
