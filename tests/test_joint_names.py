@@ -140,12 +140,46 @@ def test_names_of_the_real_file(shared_data) -> None:
          ("l_hip", "l_knee", "l_ankle", "r_shoulder", "r_elbow", "r_wrist")),
         (("LThigh", "LShin", "LFoot", "LShoulder", "LUArm", "LFArm", "LHand"),
          ("l_hip", "l_knee", "l_ankle", None, "l_shoulder", "l_elbow", "l_wrist")),
+        # Robots: NAO, Atlas; digitigrade Digit, whose toe turns below a tarsus.
+        (("LHip", "LThigh", "LTibia", "LAnklePitch", "l_ankle", "LBicep", "LElbow", "LForeArm"),
+         (None, "l_hip", "l_knee", None, "l_ankle", "l_shoulder", "l_elbow", None)),
+        (("l_lglut", "l_uleg", "l_lleg", "l_talus", "l_foot", "l_clav", "l_uarm", "l_larm"),
+         (None, "l_hip", "l_knee", None, "l_ankle", None, "l_shoulder", "l_elbow")),
+        (("left_knee", "left_shin", "left_tarsus", "left_toe_pitch"), ("l_knee", None, None, None)),
+        (("lleg", "rleg", "lfoot"), (None, None, "l_ankle")),
     ],
 )  # fmt: skip
 def test_skeletons_name_joints_by_what_they_move(
     names: tuple[str, ...], expected: tuple[str | None, ...]
 ) -> None:
     assert skeleton_joint_names(names) == expected
+
+
+TURNS = {
+    # Unitree's G1 and H1, Booster's T1, OP3, Apollo, Fourier's GR1, EngineAI's, Valkyrie.
+    "hip_pitch hip_roll* hip_yaw knee* ankle_pitch ankle_roll* shoulder_pitch shoulder_roll* "
+    "shoulder_yaw elbow* wrist_roll wrist_pitch* wrist_yaw": "left_{0}_link",
+    "hip_yaw hip_roll hip_pitch* knee* ankle* shoulder_pitch shoulder_roll* shoulder_yaw "
+    "elbow_pitch* elbow_roll": "{0}_left",
+    "Hip_Pitch Hip_Roll* Hip_Yaw Shank* Ankle_Cross": "{0}_Left",
+    "sho_pitch sho_roll* el* hip_yaw hip_roll hip_pitch* knee* ank_pitch ank_roll*": "l_{0}_link",
+    "shoulder_aa shoulder_ie shoulder_fe* elbow_fe* hip_ie hip_aa hip_fe* knee_fe*": "l_{0}_link",
+    "thigh_roll thigh_yaw thigh_pitch* shank_pitch* foot_pitch foot_roll* upper_arm_pitch "
+    "upper_arm_roll* upper_arm_yaw lower_arm_pitch* hand_yaw hand_pitch*": "left_{0}_link",
+    "HIP_PITCH HIP_ROLL* HIP_YAW KNEE_PITCH* ELBOW_PITCH* ELBOW_YAW": "LINK_{0}_L",
+    "HipYawLink HipRollLink HipPitchLink* KneePitchLink* ElbowPitchLink* ForearmLink": "left{0}",
+}
+"""Links that turn one joint about an axis each; with a star those where it is."""
+
+
+@pytest.mark.parametrize("links", TURNS)
+def test_a_joint_of_several_links_is_where_the_limb_starts_to_swing(links: str) -> None:
+    form = TURNS[links]
+    names = [f.format(each) for f in (form, other_side(form)) for each in links.split()]
+    found = skeleton_joint_names([name.replace("*", "") for name in names])
+    assert [name is not None for name in found] == ["*" in name for name in names]
+    half = len(found) // 2
+    assert [name and name.replace("l_", "r_", 1) for name in found[:half]] == list(found[half:])
 
 
 @given(st.lists(st.text(max_size=12), max_size=6))
@@ -171,7 +205,8 @@ def other_side(form: str) -> str:
     for left, right in (("Left", "Right"), ("left", "right"), ("_L_", "_R_"), (" L ", " R ")):
         if left in form:
             return form.replace(left, right)
-    for left, right in (("L_", "R_"), ("l_", "r_"), ("_l", "_r"), (".L", ".R"), (" L", " R")):
+    for left, right in (("L_", "R_"), ("l_", "r_"), ("_l", "_r"), (".L", ".R"), (" L", " R"),
+                        ("_L", "_R")):  # fmt: skip
         if left in form:
             return form.replace(left, right)
     return form.replace("l{", "r{").replace("L{", "R{")

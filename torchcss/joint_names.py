@@ -270,17 +270,23 @@ def _of_limbs(*words: str) -> dict[str, tuple[str, ...]]:
 
 
 LIMB_WORDS: Final = _of_limbs(
-    "upleg upperleg legupper thigh thighbend hip",
-    "knee lowerleg lowleg leglower leg calf shin shank",
-    "ankle footankle foot",
-    "upperarm uparm armupper uarm bicep arm shldr shldrbend shoulder",
-    "elbow forearm lowerarm lowarm armlower farm larm forearmbend",
+    "upleg upperleg legupper uleg thigh thighbend hip",
+    "knee lowerleg lowleg leglower lleg leg calf shin shank tibia",
+    "ankle ank footankle foot",
+    "upperarm uparm armupper uarm bicep arm shldr shldrbend shoulder sho",
+    "elbow el forearm lowerarm lowarm armlower farm larm forearmbend",
     "wrist handwrist hand",
 )
 """What skeletons call the joint in which a limb's segment starts, without side and prefix; of
 several that are there the first: MotionBuilder, Mixamo, Rokoko; Unity, VRM and Xsens; Unreal,
 Biped and Character Creator; Rigify and Auto-Rig Pro; Poser and DAZ Studio; OptiTrack; mocopi; Meta;
 MikuMikuDance in English; Softimage; Kinect, SMPL and robots."""
+
+_TURNS: Final = names_in("pitch roll yaw fe aa ie")
+"""What robots call the links of a joint of several axes (`l_hip_pitch`): by its turns, or by
+flexion, abduction and rotation of the limb."""
+_ABOUT_ITSELF: Final = ("yaw", "ie")
+"""Turns of a limb about itself: where along the limb their links start says nothing."""
 
 _SEGMENTS: Final = frozenset(
     word for place, words in LIMB_WORDS.items() for word in words if word not in (place, "foot")
@@ -312,7 +318,8 @@ def skeleton_joint_names(names: Sequence[str], *, ends: bool = False) -> tuple[s
     A skeleton's joint is called after what it moves: `LeftArm` and `lhumerus` are shoulders, and
     then `LeftShoulder` is the collar bone's joint. Where its names are those of joints, they are
     read as by `canonical_joint_name`. The side may stand anywhere; what most names begin with is
-    the character's.
+    the character's. Of several links that turn one joint of a robot about an axis each, a knee or
+    an elbow is the first, and another joint the last that swings the limb: it starts there.
 
     Args:
         names: The skeleton's joint names.
@@ -325,13 +332,13 @@ def skeleton_joint_names(names: Sequence[str], *, ends: bool = False) -> tuple[s
     tables = (*((_ENDS,) if ends else ()), LIMB_WORDS, _ACCLAIM)
     table = max(tables, key=lambda table: len(_limbs(spelt, table)))
     found = _limbs(spelt, table)
-    segments = table is not LIMB_WORDS or any(place in _SEGMENTS for _, place in spelt)
+    segments = table is not LIMB_WORDS or any(place in _SEGMENTS for _, place, _ in spelt)
     result: list[str | None] = [None] * len(names)
     for name, index in found.items():
         result[index] = name
-    for index, (side, place) in enumerate(spelt):
+    for index, (side, place, turn) in enumerate(spelt):
         known = _SKELETON_PLACES.get(place)
-        if known is not None and (known in _PAIRED) == bool(side):
+        if known is not None and (known in _PAIRED) == bool(side) and not (side and turn):
             name = side + known
         else:
             name = None if segments else canonical_joint_name(names[index])
@@ -340,14 +347,16 @@ def skeleton_joint_names(names: Sequence[str], *, ends: bool = False) -> tuple[s
     return tuple(result)
 
 
-def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]]) -> dict[str, int]:
+def _limbs(
+    spelt: Sequence[tuple[str, str, str]], table: Mapping[str, Sequence[str]]
+) -> dict[str, int]:
     """Which joints are those of the limbs, by the catalogue's names."""
-    places = {place for _, place in spelt}
+    places = {place for _, place, _ in spelt}
     # `arm` and `leg` are a limb's upper or lower part only beside words for the other.
     alone = not places & {"upleg", "upperleg", "thigh", "forearm", "lowerarm", "elbow"}
     # Beside a shin or knee, and no word for what is above it, `leg` is the thigh (SOMA).
     is_thigh = bool(places & {"shin", "shank", "calf", "knee"}) and not any(
-        side and place in table["hip"] for side, place in spelt
+        side and place in table["hip"] for side, place, _ in spelt
     )
     found: dict[str, int] = {}
     for limb, words in table.items():
@@ -356,14 +365,18 @@ def _limbs(spelt: Sequence[tuple[str, str]], table: Mapping[str, Sequence[str]])
         elif alone:
             words = tuple(word for word in words if word not in ("arm", "leg"))
         for side in ("l_", "r_"):
-            there = [word for word in words if (side, word) in spelt]
-            if there:
-                found[side + limb] = spelt.index((side, there[0]))
+            turns = {word: [k for k, each in enumerate(spelt) if each[:2] == (side, word)]
+                     for word in words}  # fmt: skip
+            if there := next(filter(None, turns.values()), None):
+                whole = [k for k in there if not spelt[k][2]]
+                swings = [k for k in there if spelt[k][2] not in _ABOUT_ITSELF]
+                is_hinge = bool(whole) or limb in ("knee", "elbow")
+                found[side + limb] = (whole or there)[0] if is_hinge else (swings or there)[-1]
     return found
 
 
-def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Side and place of every name, in small letters, without what they begin or end with."""
+def _spelt(names: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Side, place and turn of every name, in small letters, without what they begin or end with."""
     known = {*_SKELETON_PLACES, *_PLACES}
     known.update(
         word for table in (LIMB_WORDS, _ACCLAIM, _ENDS) for ws in table.values() for word in ws
@@ -379,15 +392,17 @@ def _spelt(names: Sequence[str]) -> list[tuple[str, str]]:
         split.append((known_sides[words.pop(sides[0])] if len(sides) == 1 else "", words))
     every = [word for _, words in split for word in set(words)]
     common = {word for word in every if 2 * every.count(word) >= len(names)}
-    common |= {"def", "stretch"}
-    result: list[tuple[str, str]] = []
+    common |= {"def", "stretch", "link", *_TURNS}
+    result: list[tuple[str, str, str]] = []
     for side, words in split:
+        turn = ""
+        while words and words[-1] in common - known and "".join(words) not in known:
+            turn = words[-1] if words[-1] in _TURNS else turn
+            words = words[:-1]
         while words and words[0] in common and "".join(words) not in known:
             words = words[1:]
-        while words and words[-1] in common and "".join(words) not in known:
-            words = words[:-1]
         place = "".join(words)
-        if not side and place not in known:
+        if not side:
             side, place = _unglued(place, known)
-        result.append((side, place))
+        result.append((side, place, turn))
     return result

@@ -399,6 +399,9 @@ def test_a_free_root_is_upright_and_at_the_body(tmp_path: Path, shared_data: Pat
     assert float(knee[0]) > 0.05
 
 
+SIDES = {"left": 0.06, "right": -0.06}
+
+
 def test_limits_and_names_of_the_humanoids(shared_data: Path) -> None:
     gym = load_body(robot(shared_data, "humanoid_gym.xml"))
     knee = gym.state_index("right_knee")
@@ -412,6 +415,42 @@ def test_limits_and_names_of_the_humanoids(shared_data: Path) -> None:
     joints = cmu.pose(torch.zeros(cmu.num_parameters, dtype=torch.float64)).joints
     thigh = joints[cmu.joint_index("l_hip")] - joints[cmu.joint_index("l_knee")]
     assert float(thigh.norm()) == pytest.approx(0.404945)
+
+
+def test_a_robot_meets_the_keypoints_of_people(tmp_path: Path) -> None:
+    """Legs whose hips are three links; a pelvis above the hips; a link that is no shoulder."""
+    rows = [("pelvis", f"{side}_hip_pitch", f"0 {y} -0.1") for side, y in SIDES.items()]
+    for side, y in SIDES.items():
+        rows += [(f"{side}_hip_pitch", f"{side}_hip_roll", f"0 {y} -0.03"),
+                 (f"{side}_hip_roll", f"{side}_hip_yaw", "0 0 -0.12"),
+                 (f"{side}_hip_yaw", f"{side}_knee", "0 0 -0.18"),
+                 ("pelvis", f"{side[0]}_shoulder", f"0 {y} 0.4"),
+                 (f"{side[0]}_shoulder", f"{side}_upper_arm", f"0 {y} 0"),
+                 (f"{side}_upper_arm", f"{side}_forearm", "0 0 -0.2")]  # fmt: skip
+    joints = "".join(
+        f'<link name="{child}_link"/><joint name="{child}" type="revolute"><axis xyz="0 1 0"/>'
+        f'<parent link="{parent}_link"/><child link="{child}_link"/><origin xyz="{place}"/></joint>'
+        for parent, child, place in rows
+    )
+    text = f'<robot name="r"><link name="pelvis_link"/>{joints}</robot>'
+    text = text.replace("_shoulder_link", "_shoulder")
+    body = load_body(write(tmp_path / "robot.urdf", text))
+    assert len(set(body.joint_names)) == len(body.joint_names)
+    places = body.pose(torch.zeros(body.num_parameters, dtype=torch.float64)).joints
+    at = {name: place.tolist() for name, place in zip(body.joint_names, places, strict=True)}
+    for side, y in SIDES.items():
+        assert at[f"{side[0]}_hip"] == pytest.approx([0, 2 * y, -0.13])
+        assert at[f"{side[0]}_knee"] == pytest.approx([0, 2 * y, -0.43])
+        assert at[f"{side[0]}_shoulder"] == pytest.approx([0, 2 * y, 0.4])
+        assert at[f"{side[0]}_shoulder_2"] == pytest.approx([0, y, 0.4])
+    assert at["pelvis_link"] == pytest.approx([0, 0, 0])
+    assert "HumanoidRoot" not in at  # no link carries both hips: the first turn moves them
+    assert body.joint_of_name["l_shoulder"] == "l_shoulder"
+    for y in SIDES.values():  # three axes that meet
+        text = text.replace(f'"0 {y} -0.03"', '"0 0 0"')
+    body = load_body(write(tmp_path / "robot.urdf", text.replace('"0 0 -0.12"', '"0 0 0"')))
+    places = body.pose(torch.zeros(body.num_parameters, dtype=torch.float64)).joints
+    assert places[body.joint_index("HumanoidRoot")].tolist() == pytest.approx([0, 0, -0.1])
 
 
 def test_primitives_of_a_urdf(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ A free root is Y up and faces +Z, as in the catalogue; robot files, Z up and fac
 turned accordingly, by their root link. A fixed body stands in the frame of its file.
 
 Joints that have a name of ours (`torchcss.joint_names.skeleton_joint_names`) are landmarks under
-that name, the others under the file's; the middle of the hips is one if one link carries both.
+that name, the others under the file's, with a number where that is another's name; the middle of
+the hips is one if one link carries both.
 
 Call `load_body`; `has_free_root` tells bodies that move about from arms.
 """
@@ -38,7 +39,7 @@ from torchcss.body.catalog import (
 )
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import HungTree, read_bvh_skeleton
-from torchcss.body.files.default_shape import bone_parts, rest_poses, touching_parts
+from torchcss.body.files.default_shape import bone_parts, rest_poses, touching_parts, unused
 from torchcss.body.files.mjcf import read_mjcf
 from torchcss.body.files.urdf import read_urdf
 from torchcss.body.files.xml import parse_xml
@@ -190,14 +191,11 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
             f"it reaches {reach:.0f} m, as its lengths count as metres: write those of a file in "
             "millimetres as metres, or load it in Python by load_body(..., scale=0.001)",
         )
-    markers = [
-        MarkerSpecification(name=landmarks.get(link, link), link=link) for link in skeleton.places
-    ]
     return BodySpecification(
         name=str(path),
         joints=joints,
         parts=parts,
-        markers=(*_middle_of_hips(joints, landmarks), *markers),
+        markers=_markers(joints, skeleton.places, landmarks),
         ties={},
         sticky=skeleton.sticky,
         neighbours=touching_parts(joints, parts),
@@ -224,13 +222,25 @@ def _read(
     return *read_urdf(root, path.parent), _Y_UP
 
 
+def _markers(
+    joints: tuple[JointSpecification, ...], places: tuple[str, ...], landmarks: dict[str, str]
+) -> tuple[MarkerSpecification, ...]:
+    """A joint centre at the origin of every link that the file names, and between the hips."""
+    middle: list[MarkerSpecification] = []
+    if {"l_hip", "r_hip"} <= {*landmarks.values()} and "HumanoidRoot" not in places:
+        # Detectors mark it between the hips: a pelvis may start far above.
+        landmarks = {link: name for link, name in landmarks.items() if name != "HumanoidRoot"}
+        middle = _middle_of_hips(joints, landmarks)
+    taken = [*landmarks.values(), *(marker.name for marker in middle)]
+    named = {link: landmarks.get(link) or unused(link, taken) for link in places}
+    return (*middle, *(MarkerSpecification(name=named[link], link=link) for link in places))
+
+
 def _middle_of_hips(
     joints: tuple[JointSpecification, ...], landmarks: dict[str, str]
 ) -> list[MarkerSpecification]:
     """The landmark `HumanoidRoot`, if both hips sit at fixed places of one link."""
     link_of = {name: link for link, name in landmarks.items()}
-    if not {"l_hip", "r_hip"} <= set(link_of) or "HumanoidRoot" in link_of:
-        return []
     by_link = {joint.link: joint for joint in joints}
 
     def carriers(link: str) -> list[str]:

@@ -197,13 +197,13 @@ class BodyModel(nn.Module):
     def joint_of_name(self) -> dict[str, str]:
         """Joint centres by what the body's file calls the link at whose origin they are.
 
-        Their own names count where no link has them. Empty for a body that ships.
+        A joint centre's own name is never another's. Empty for a body that ships.
         """
         if self.name in BODY_NAMES:
             return {}
         markers = self.specification.markers
         links = {mark.link: mark.name for mark in markers if not any(mark.translation)}
-        return {**{name: name for name in self.joint_names}, **links}
+        return links | {name: name for name in self.joint_names}
 
     def joint_index(self, name: str) -> int:
         """Position of a joint centre on axis `j`.
