@@ -121,6 +121,12 @@ def test_damaged_files(
         read_fitted_body(path)
 
 
+def test_a_track_is_no_fitted_body(tmp_path: Path) -> None:
+    np.savez(tmp_path / "track.npz", schema_version=2, state=np.zeros((3, 1, 34)))
+    with pytest.raises(BodyError, match=r"track\.npz: not a fitted body.*expected a body\.npz"):
+        read_fitted_body(tmp_path / "track.npz")
+
+
 ROBOT = (
     "<robot name='r'><link name='a'/><link name='b'/><link name='c'/>"
     "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"

@@ -253,8 +253,9 @@ def test_truncated_video_keeps_the_frames(clip: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     "bad",
     [
-        {"terms": ("contour", "magic")}, {"samples": 0}, {"working_size": 0}, {"device": "cuda:99"},
-        {"keypoints_use": "frist"}, {"engine": "none"}, {"dtype": "float16"}, {"dtype": None},
+        {"terms": ("contour", "magic")}, {"samples": 0}, {"working_size": 63},
+        {"device": "cuda:99"}, {"keypoints_use": "frist"}, {"engine": "none"},
+        {"dtype": "float16"}, {"dtype": None},
         {"curvature": "some"}, {"prediction": "none"}, {"modes": 2.5}, {"samples": "6"},
     ],
 )  # fmt: skip

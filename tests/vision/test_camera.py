@@ -406,7 +406,7 @@ def test_values_of_any_type_are_taken() -> None:
     [
         ({"K": [[1.0, 0.0], [0.0, 1.0]]}, r"shape \[3, 3\]"),
         ({"K": [[-900.0, 0, 1], [0, 900.0, 1], [0, 0, 1]]}, "positive"),
-        ({"K": [[900.0, 5.0, 1], [0, 900.0, 1], [0, 0, 1]]}, "no skew"),
+        ({"K": [[900.0, 5.0, 1], [0, 900.0, 1], [0, 0, 1]]}, "no skew.*write 0"),
         ({"K": [[900.0, 0, math.nan], [0, 900.0, 1], [0, 0, 1]]}, "finite"),
         ({"K": "calibration"}, "numbers"),
         ({"image_size_wh": (0, 480)}, "image_size_wh"),

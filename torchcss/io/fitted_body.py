@@ -120,12 +120,12 @@ def read_fitted_body(
         path = path / FITTED_BODY_NAME
     arrays = load_arrays(path, BodyError)
     try:
+        names, values = arrays["length_names"].tolist(), arrays["lengths"].tolist()
         if int(arrays["schema_version"]) != BODY_VERSION:
             raise BodyError(
                 f"{path}: schema version {int(arrays['schema_version'])}, expected "
                 f"{BODY_VERSION}; write the file with this version of torchcss init"
             )
-        names, values = arrays["length_names"].tolist(), arrays["lengths"].tolist()
         lengths, scale = dict(zip(names, values, strict=True)), float(arrays["scale"])
         body = _load_body(path, arrays, {name: lengths[name] / scale for name in names}, scale)
         tensors = {
@@ -134,8 +134,8 @@ def read_fitted_body(
         }
     except KeyError as error:
         raise BodyError(
-            f"{path}: not a fitted body: {error.args[0]} is missing; expected what torchcss init "
-            "writes"
+            f"{path}: not a fitted body: {error.args[0]} is missing; expected a body.npz, as "
+            "torchcss init and torchcss track write it"
         ) from error
     except BodyError:
         raise

@@ -141,7 +141,7 @@ class Settings:
         curvature: Which Hessian the optimiser gets; the preset's by default. "autograd" is the slow
             reference.
         working_size: Longer side, in pixels, at which features are computed; larger images are
-            reduced to it.
+            reduced to it. At least 64.
         contour_weight: Temperature of the contour term, see `ContourTerm`.
         weights: Further factors on terms and priors by name; `scripts/learn_weights.py` learns
             some.
@@ -231,6 +231,7 @@ class Settings:
         make_whole(self, "seed", "limb_jumps", *counts)
         check_seed(self.seed)
         check_range(self, *counts, least=1)
+        check_range(self, "working_size", least=64, hint="; smaller pictures show no limbs")
         check_range(self, "contour_weight", "limb_jumps")
         check_range(self, "boundary_emphasis", most=1)
         if self.likelihood_power is not None and not 0 < self.likelihood_power <= 1:

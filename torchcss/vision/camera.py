@@ -741,7 +741,8 @@ def _checked_intrinsics(name: str, value: object) -> Matrix:
     rest = torch.stack([K[0, 1], K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1.0])
     if (rest.abs() > 1.0e-9 * K[0, 0]).any():
         raise CameraError(
-            f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew), got {K.tolist()}"
+            f"{name}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew), got {K.tolist()}; "
+            "calibrate without skew, or write 0 for it if that moves no point by a pixel"
         )
     return K
 
