@@ -146,6 +146,8 @@ def test_names_of_the_real_file(shared_data) -> None:
         (("l_lglut", "l_uleg", "l_lleg", "l_talus", "l_foot", "l_clav", "l_uarm", "l_larm"),
          (None, "l_hip", "l_knee", None, "l_ankle", None, "l_shoulder", "l_elbow")),
         (("left_knee", "left_shin", "left_tarsus", "left_toe_pitch"), ("l_knee", None, None, None)),
+        (("Hip_Roll_Left", "Shank_Left", "left_foot_link", "left_hand_link"),
+         ("l_hip", "l_knee", "l_ankle", None)),
         (("lleg", "rleg", "lfoot"), (None, None, "l_ankle")),
     ],
 )  # fmt: skip

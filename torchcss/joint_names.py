@@ -372,6 +372,11 @@ def _limbs(
                 swings = [k for k in there if spelt[k][2] not in _ABOUT_ITSELF]
                 is_hinge = bool(whole) or limb in ("knee", "elbow")
                 found[side + limb] = (whole or there)[0] if is_hinge else (swings or there)[-1]
+    for side in ("l_", "r_"):
+        # Below no elbow a hand may be the whole forearm, and start there (Booster's T1).
+        hand = found.get(side + "wrist")
+        if hand is not None and spelt[hand][1] == "hand" and side + "elbow" not in found:
+            del found[side + "wrist"]
     return found
 
 
