@@ -393,9 +393,9 @@ def _descent(css: Mapping[str, Any], _: Mapping[str, Any]) -> tuple[str, bool]:
 
 
 def _separated(css: Mapping[str, Any], _: Mapping[str, Any]) -> tuple[str, bool]:
-    """Counted as one within half and within twice the distance, there are as many to a tenth."""
-    counts = css["minima_half"], css["minima"], css["minima_double"]
-    return "{:g}, {:g}, {:g}".format(*counts), counts[0] <= 1.1 * counts[1] <= 1.21 * counts[2]
+    """Counted as one within half and within twice the distance, as many to a tenth, or one."""
+    half, found, double = counts = css["minima_half"], css["minima"], css["minima_double"]
+    return "{:g}, {:g}, {:g}".format(*counts), half - double <= max(1, 0.2 * found)
 
 
 def median_costs(evidence: Evidence) -> Finding:
