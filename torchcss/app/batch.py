@@ -479,10 +479,11 @@ class Job(NamedTuple):
         summary = {}
         with suppress(TorchcssError):
             summary = read_summary(self.out / name)
+        seconds = summary.get("seconds_per_frame")
         return {
             "frames": summary.get("num_frames", ""),
             "told_lost": sum(event["event"] == "lost" for event in summary.get("events", ())),
-            "seconds_per_frame": round(summary.get("seconds_per_frame", 0.0), 2),
+            "seconds_per_frame": round(seconds, 2) if isinstance(seconds, float) else "",
         }
 
     def report(self) -> str:
