@@ -393,7 +393,7 @@ def _descent(css: Mapping[str, Any], _: Mapping[str, Any]) -> tuple[str, bool]:
 
 
 def _separated(css: Mapping[str, Any], _: Mapping[str, Any]) -> tuple[str, bool]:
-    """Counted as one within half and within twice the distance, as many to a tenth, or one."""
+    """Half and twice the distance within which two are one change the count by a tenth, or one."""
     half, found, double = counts = css["minima_half"], css["minima"], css["minima_double"]
     return "{:g}, {:g}, {:g}".format(*counts), half - double <= max(1, 0.2 * found)
 

@@ -213,14 +213,14 @@ def pack_edges(term: ContourTerm, bound: OnPoints, context: FrameContext) -> Edg
     if potential is None or min(height, width) < 2:
         return None
     reach = math.ceil(term.window / term.step) + 2
+    # In whole eights, which are sampled at once; edges beyond the window count nothing.
+    count = 8 * math.ceil((2 * reach + 1) / 8)
     back_facing = term.fitted_level * term.nu
     return Edges(
         scale=bound.scale,
         field=field.movedim(0, -1),
         corner=torch.tensor([width - 1.0, height - 1.0]),
-        # In whole eights, which are sampled at once; edges beyond the window count nothing.
-        steps=term.step
-        * torch.arange(-reach, -reach + 8 * math.ceil((2 * reach + 1) / 8)).double(),
+        steps=term.step * torch.arange(-reach, count - reach).double(),
         step=term.step,
         window=term.window,
         unmatched=term.unmatched,
