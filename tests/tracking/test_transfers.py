@@ -14,12 +14,18 @@ from torchcss.studies.render.sequences import SyntheticSequence
 OBSERVED = 12
 """Waits of the host while the features of a frame are made."""
 
-STEPPED = {"arm": 500, "person": 640}
-"""Waits of the host in the step of a frame, in the mean over seeds, which differ by a third: 22 to
-42 evaluations of a few samples each. Over twelve seeds the means are 505 and 612."""
+STEPPED = {"arm": 40, "person": 80}
+"""Waits of the host in the step of a frame beside those of its evaluations."""
 
-EVALUATED = {"arm": 17, "person": 20}
-"""The same for every evaluation of the cost, which hardly differs."""
+EVALUATED = {"arm": 13, "person": 15}
+"""Waits of the host for every evaluation of the cost and the step that is planned with it.
+
+A frame has 22 to 56 evaluations of a few samples each, by the seed and by how the processor rounds;
+over twelve seeds 32 in the mean, so that it waits 449 times for an arm and 548 for a person.
+"""
+
+EVALUATIONS = 45
+"""Evaluations in the step of a frame, in the mean over seeds."""
 
 _SEEDS = range(4)
 
@@ -29,7 +35,7 @@ def test_a_frame(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = moving_arm(3)
     if name == "person":
         sequence = standing_person(sequence)
-    calls = Counter()
+    calls: Counter[str] = Counter()
     for method in ("_value", "local_model"):
         evaluate = getattr(TrackingCost, method)
 
@@ -38,12 +44,13 @@ def test_a_frame(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
             return of(self, *args)
 
         monkeypatch.setattr(TrackingCost, method, counted)
-    total = 0
+    evaluations = 0
     for seed in _SEEDS:
         stepping = _waits(sequence, seed, calls)
-        total += stepping.waits.total()
-        assert stepping.waits.total() <= EVALUATED[name] * calls.total(), _worst(stepping)
-    assert total / len(_SEEDS) <= STEPPED[name]
+        budget = STEPPED[name] + EVALUATED[name] * calls.total()
+        assert stepping.waits.total() <= budget, _worst(stepping)
+        evaluations += calls.total()
+    assert evaluations / len(_SEEDS) <= EVALUATIONS
 
 
 def _waits(sequence: SyntheticSequence, seed: int, calls: Counter[str]) -> Transfers:

@@ -185,10 +185,7 @@ class ContourTerm(OutlineTerm):
         line = torch.addcmul(start[:, None], steps[:, None], along[:, None]).movedim(0, -1)
         field_u, field_v = interpolate_bilinear(edge_field, line).unbind(-1)
         response = torch.addcmul(field_u * along[0], field_v, along[1]).abs()
-        # The image is convex: only lines with an end outside leave it.
-        ends = line[:: len(steps) - 1]
-        leaving = (~inside_image(ends, *edge_field.shape[1:])).any(0).nonzero()[:, 0]
-        response[:, leaving] *= inside_image(line[:, leaving], *edge_field.shape[1:])
+        response *= inside_image(line, *edge_field.shape[1:])
 
         rises = response[1:] > response[:-1]
         peak = places(rises[1:-2] & ~rises[2:-1])

@@ -639,17 +639,18 @@ def _damped_step(
         stuck = too_short & ((lo >= 0.5 * lam) | (remaining == 0))
         best = d * (rad / torch.where(size > rad, size, rad))[:, None]
         again = ~ok | too_long | (too_short & ~stuck)
-        some_hard, some_left = torch.stack([stuck.any(), again.any()]).tolist()  # one transfer
-        if some_hard:
-            hard = torch.nonzero(stuck)[:, 0]
+        hard, left = (  # one transfer
+            torch.as_tensor(np.flatnonzero(mask), device=todo.device)
+            for mask in torch.stack([stuck, again]).tolist()
+        )
+        if len(hard):
             best[hard] = _along_negative_curvature(
                 problem, todo[hard], lam[hard, None] * weight, d[hard], rad[hard]
             )
         step[todo] = torch.where(ok[:, None], best, step[todo])
         found[todo] = torch.where(ok, lam, torch.maximum(found[todo], 10 * lam))
-        if remaining == 0 or not some_left:
+        if remaining == 0 or not len(left):
             break
-        left = torch.nonzero(again)[:, 0]
         todo, lam, rad, guess, lo, hi, size, slope, ok, flat = (
             part[left] for part in (todo, lam, rad, guess, lo, hi, size, slope, ok, flat)
         )
