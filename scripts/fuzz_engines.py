@@ -11,19 +11,21 @@ are compared in both precisions: values in nats, derivatives by the largest entr
 and values after a small motion with visibility and matches held.
 
 Left out are states with an edge within 1e-3 px of a search window's end, where derivatives jump,
-and in single precision derivatives: a threshold that rounding moves (a crossing of a contour, a
-maximum on a search line) moves a few of them.
+and in single precision derivatives, which have to be numbers there: a threshold that rounding moves
+(a crossing of a contour, a maximum on a search line) moves a few of them.
 
 A difference is printed with the seed of its case, which `--first` takes, and the terms that differ.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from common import start, write_report
 from torch import Tensor
@@ -107,7 +109,7 @@ class Difference(NamedTuple):
         body: Its body.
         dtype: Precision of the kernels.
         value: Of values.
-        derivatives: Of gradients and Hessians; zero where they are not compared.
+        derivatives: Of gradients and Hessians; zero where they are numbers and not compared.
         terms: Terms whose values differ by more than is allowed.
     """
 
@@ -117,6 +119,11 @@ class Difference(NamedTuple):
     value: float
     derivatives: float
     terms: tuple[str, ...]
+
+    @property
+    def fails(self) -> bool:
+        """Whether it differs by more than is allowed, or is no number."""
+        return not (self.value <= 1 and self.derivatives <= 1)
 
 
 def draw_body(draw: Draw, name: str) -> BodyModel:
@@ -267,15 +274,12 @@ def compare(cost: TrackingCost, x: Tensor, dtype: Any) -> tuple[float, float]:
     fused = engine.local_model(x)
     allowed = NATS[dtype] + RELATIVE[dtype] * eager.value.abs()
     moved = x + 0.01 * torch.cos(100 * x)  # some way from where matches are found
-    value = max(
-        float(((found - eager.value).abs() / allowed).max())
-        for found in (fused.value, engine.value(x))
-    )
+    apart = [(found - eager.value).abs() / allowed for found in (fused.value, engine.value(x))]
     held = engine.held_value(moved, x), replace(cost, engine=None).held_value(moved, x)
-    difference = (held[0] - held[1]).abs() / (NATS[dtype] + RELATIVE[dtype] * held[1].abs())
-    value = max(value, float(difference.max()))
+    apart.append((held[0] - held[1]).abs() / (NATS[dtype] + RELATIVE[dtype] * held[1].abs()))
+    value = float(torch.stack(apart).max())  # NaN if any is
     if dtype == "float32":
-        return value, 0.0
+        return value, 0.0 if all(bool(part.isfinite().all()) for part in fused) else math.nan
     largest = [
         (a - b).abs().flatten(1).amax(1) / (1 + b.abs().flatten(1).amax(1))
         for a, b in zip(fused[1:], eager[1:], strict=True)
@@ -291,12 +295,14 @@ def run_case(seed: int, name: str, states: int) -> tuple[list[Difference], int]:
     cost, x, found = cost.take(index), x[index], []
     for dtype in NATS:
         value, derivatives = compare(cost, x, dtype) if len(x) else (0.0, 0.0)
-        names: tuple[str, ...] = ()
-        if not max(value, derivatives) <= 1:
+        row = Difference(seed, name, dtype, value, derivatives, ())
+        if row.fails:
             every = [term.name for term in cost.choice.terms]
             alone = {n: replace(cost, choice=cost.choice.only([n])) for n in every}
-            names = tuple(n for n in every if not max(compare(alone[n], x, dtype)) <= 1)
-        found.append(Difference(seed, name, dtype, value, derivatives, names))
+            apart = {n: Difference(seed, name, dtype, *compare(alone[n], x, dtype), ())
+                     for n in every}  # fmt: skip
+            row = row._replace(terms=tuple(n for n in every if apart[n].fails))
+        found.append(row)
     return found, states - len(x)
 
 
@@ -310,16 +316,14 @@ def compare_engines(config: Config) -> dict[str, Any]:
         found, some = run_case(seed, name, config.states)
         rows, left_out = [*rows, *found], left_out + some
         for row in found:
-            if not max(row.value, row.derivatives) <= 1:
+            if row.fails:
                 print(f"seed {row.seed}, {row.body}, {row.dtype}: {row.value:.1e} of what values "
                       f"may differ, {row.derivatives:.1e} of derivatives; "
                       f"{', '.join(row.terms) or 'no term alone'}", flush=True)  # fmt: skip
-    failed = [row for row in rows if not max(row.value, row.derivatives) <= 1]
+    failed = [row for row in rows if row.fails]
     for dtype in NATS:
         own = [row for row in rows if row.dtype == dtype]
-        values, derivatives = (
-            max(getattr(r, key) for r in own) for key in ("value", "derivatives")
-        )
+        values, derivatives = np.max([(row.value, row.derivatives) for row in own], 0)
         print(f"{dtype}: values within {values:.1e} of {NATS[dtype]:g} nats, derivatives "
               f"{derivatives:.1e}")  # fmt: skip
     print(f"{config.cases} cases, {len({row.seed for row in failed})} differ, {left_out} states "

@@ -236,6 +236,20 @@ def test_maximum_radius_is_where_the_distortion_stops_growing() -> None:
 
 
 @pytest.mark.parametrize(
+    "distortion", [[0.0, 0.0, 0.0, 0.0, 0.05], [1e-3, 0.2, 0.0, 0.0, 0.0], [500.0, 0.0, 0.0, 0.0]]
+)
+def test_squares_of_pixels_are_finite_in_single_precision(distortion: list[float]) -> None:
+    """Points next to the image plane, which a growing distortion throws away farthest."""
+    camera = make_camera(distortion)
+    assert camera.maximum_radius > 50  # 1.1 degrees from the image plane
+    radius = torch.logspace(0, 5, 200)
+    ahead = torch.stack([radius, torch.zeros_like(radius), torch.ones_like(radius)], -1)
+    uv, _, valid = camera.project(points_in_camera_frame(camera, ahead).float())
+    assert uv[valid].square().sum(-1).isfinite().all()
+    assert valid.sum() > 60
+
+
+@pytest.mark.parametrize(
     "distortion", [None, MILD, WILD, [0.5, 0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.01, 0.0, 0.0]]
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

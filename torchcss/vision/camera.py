@@ -75,6 +75,9 @@ _LEVEL = 0.2
 GRAZING_RADIUS = 1.0e4
 """Normalised radius (0.006 degrees from the image plane) beyond which powers overflow float32."""
 
+_LARGEST_TERM = 1.0e14
+"""Largest term of the distortion: beyond it squares of pixels overflow float32."""
+
 _ORTHONORMALITY_TOLERANCE = 1.0e-4
 """Largest eigenvalue of `R R^T - I` that is taken for rounding in a calibration file."""
 
@@ -149,7 +152,7 @@ class Camera(nn.Module):
     Attributes:
         has_distortion: Whether any coefficient of the distortion differs from zero.
         maximum_radius: Distance from the axis at unit depth up to which the distortion can be
-            undone; points farther out are invalid.
+            undone, and squares of pixels are finite in float32; points farther out are invalid.
 
     Raises:
         CameraError: If a value is not finite, `K` is not of the form above, the rotation is not
@@ -695,7 +698,7 @@ def _within_radius(point: Pixels, limit: Tensor) -> Pixels:
 
 
 def _monotonic_radius(distortion: Float[Tensor, " 5"]) -> Float[Tensor, ""]:
-    """Return the radius where the radial distortion stops growing, inf where it never does.
+    """Return the radius where the radial distortion stops growing, or is too large; inf: nowhere.
 
     The derivative of r q(r^2) is 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3 with s = r^2. The tangential
     terms, small in any real lens, are left out.
@@ -704,8 +707,11 @@ def _monotonic_radius(distortion: Float[Tensor, " 5"]) -> Float[Tensor, ""]:
     terms = (7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0)
     roots = np.roots([term if abs(term) > 1e-100 else 0.0 for term in terms])  # 1 / term is finite
     real = roots.real[np.abs(roots.imag) <= 1.0e-9 * np.abs(roots)]
-    positive = real[real > 0.0]
-    return distortion.new_tensor(math.sqrt(positive.min()) if positive.size else math.inf)
+    ends = [math.sqrt(root) for root in real if root > 0.0]
+    for k, power in ((k1, 3), (k2, 5), (k3, 7)):
+        if abs(k) * GRAZING_RADIUS**power > _LARGEST_TERM:
+            ends.append((_LARGEST_TERM / abs(k)) ** (1 / power))
+    return distortion.new_tensor(min(ends, default=math.inf))
 
 
 def _checked_image_size(name: str, image_size_wh: Sequence[int]) -> tuple[int, int]:
