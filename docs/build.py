@@ -44,6 +44,11 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 DOCS = REPOSITORY / "docs"
 README_PAGES = {"contributing": "Contributing"}
 """Sections of the README that are pages of their own; all others make up the front page."""
+RECORD = (
+    *("results", "findings", "tried", "recordings"),
+    *("from_the_papers_to_the_code", "decisions"),
+)
+"""What was measured, learnt and decided, in the order in which the site lists it."""
 
 _JAXTYPING = re.compile(
     r'jaxtyping\.(?=\w+\[)|<span class=\\?"n\\?">jaxtyping</span><span class=\\?"o\\?">.</span>'
@@ -138,7 +143,7 @@ def guide(out: Path, *, execute: bool) -> Iterator[tuple[str, str]]:
         yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     for notebook in sorted((REPOSITORY / "notebooks").glob("*.ipynb")):
         yield notebook.stem, notebook_text(notebook, out / "pictures", execute=execute)
-    for name in ("results", "findings", "recordings", "from_the_papers_to_the_code", "decisions"):
+    for name in RECORD:
         yield name, (DOCS / f"{name}.md").read_text(encoding="utf-8")
     yield "scripts", scripts_text()
     for name, heading in README_PAGES.items():
