@@ -50,5 +50,5 @@ def checked(record: _Record) -> _Record:
 
 def run(kernel: Callable[..., None], *arguments: Any) -> None:
     """Call a kernel, tensors as arrays, which check their indices in the checked mode."""
-    arrays = (a.numpy() if isinstance(a, Tensor) else a for a in arguments)
+    arrays = [a.numpy() if isinstance(a, Tensor) else a for a in arguments]
     kernel(*map(checked, arrays) if compiler.CHECKED else arrays)

@@ -12,9 +12,8 @@ import math
 import os
 import warnings
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -99,14 +98,15 @@ class Workspaces:
     def __init__(self, make: Callable[[], Any]) -> None:
         self._make, self._idle = make, deque[Any]()
 
-    @contextmanager
-    def lent(self) -> Iterator[Any]:
-        """A workspace that nobody else has."""
+    def take(self) -> Any:
+        """A workspace that nobody else has, to be given back."""
         try:
-            workspace = self._idle.pop()
+            return self._idle.pop()
         except IndexError:
-            workspace = self._make()
-        yield workspace
+            return self._make()
+
+    def give_back(self, workspace: Any) -> None:
+        """Let others have a workspace."""
         self._idle.append(workspace)
 
 
@@ -141,8 +141,9 @@ class _Packed(NamedTuple):
         else:
             states = states[:1]
         rows = (_rows(mode, self.modes, len(states[0])),) if self.modes else ()
-        with self.workspaces.lent() as workspace:
-            run(kernel, *states, *rows, *self.records, workspace, result)
+        workspace = self.workspaces.take()
+        run(kernel, *states, *rows, *self.records, workspace, result)
+        self.workspaces.give_back(workspace)
 
 
 _Found = tuple[list[_Packed], frozenset[str]]
@@ -175,7 +176,7 @@ class FusedEngine:
         self._made_of = dtype, threads
         self.real: Any = np.float32 if dtype == "float32" else np.float64
         self._views, self._priors, self._bodies = _Packs(), _Packs(), _Packs()
-        self._workspaces: dict[tuple[int, ...], Workspaces] = {}
+        self._workspaces: dict[tuple[Any, ...], Workspaces] = {}
         self._threads = threads
         self._helpers: dict[int, ThreadPoolExecutor] = {}  # by process: a fork has no threads
 
@@ -203,7 +204,7 @@ class FusedEngine:
             result, others = self._evaluate(cost, x, slopes=True)
         shapes = (x.shape[:-1], x.shape, (*x.shape, x.shape[-1]))
         model = LocalModel(
-            *(torch.from_numpy(p).to(x).reshape(s) for p, s in zip(result, shapes, strict=True))
+            *(torch.from_numpy(p.reshape(s)).to(x) for p, s in zip(result, shapes, strict=True))
         )
         if others is None:
             return model
@@ -231,12 +232,13 @@ class FusedEngine:
         sane = np.isfinite(each[0]).all(1)
         if len(each) > 1:
             sane &= np.isfinite(each[1]).all(1)
+        all_sane = bool(sane.all())
         left_out: set[str] = set()
         for past in cost.past:
             items = None
             if cost.sequence is not None:
                 items = (cost.sequence == past.sequence).numpy() & sane
-            elif not sane.all():
+            elif not all_sane:
                 items = sane
             part = each if items is None else [np.ascontiguousarray(x[items]) for x in each]
             own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
@@ -254,7 +256,7 @@ class FusedEngine:
             if items is not None:
                 for whole, some in zip(result, own, strict=True):
                     whole[items] = some
-        for field in () if sane.all() else result:
+        for field in () if all_sane else result:
             field[~sane] = np.nan
         if not left_out:
             return result, None
@@ -274,15 +276,16 @@ class FusedEngine:
             result: What the costs are added to.
         """
         size = len(states[0])
+        if self._threads < 2 or size < 2:
+            for packed, mode in calls:
+                packed.add(states, mode, result)
+            return
 
         def add(rows: slice) -> None:
             part, some = Result(*(field[rows] for field in result)), [x[rows] for x in states]
             for packed, mode in calls:
                 packed.add(some, None if mode is None else mode[rows], part)
 
-        if self._threads < 2 or size < 2:
-            add(slice(None))
-            return
         process = os.getpid()
         if process not in self._helpers:
             self._helpers[process] = ThreadPoolExecutor(self._threads - 1)
@@ -345,7 +348,7 @@ class FusedEngine:
         repulsion = repulsion._replace(scale=real(weight * term.weight / interior))
         curves = pack.pack_curves(None, len(parts.row), real)
         records = tree, parts, repulsion, _is_exact(cost)
-        memory = self._memory(tree, curves, interior, chain, 5, 0)
+        memory = self._memory(pack.make_pair_scratch, tree, curves, interior, chain, 5, 0)
         return _Packed(add_repulsion, None, 0, records, memory)
 
     def _tree(self, body: BodyModel, context: FrameContext) -> Tree:
@@ -358,12 +361,13 @@ class FusedEngine:
         make = partial(pack.pack_parts, past.body, self.real)
         return self._bodies.of(past.tables, (pack.pack_parts,), make)
 
-    def _memory(self, tree: Tree, curves: Curves, *sizes: int) -> Workspaces:
+    def _memory(
+        self, make: Callable[..., Any], tree: Tree, curves: Curves, *sizes: int
+    ) -> Workspaces:
         """Memory that all bodies of these sizes share, one after the other."""
-        key = (len(tree.parent), *curves.table.shape, *curves[1:], *sizes)
+        key = (make, len(tree.parent), *curves.table.shape, *curves[1:], *sizes)
         if key not in self._workspaces:
-            make = partial(pack.make_workspace, tree, curves, sizes, self.real)
-            self._workspaces[key] = Workspaces(make)
+            self._workspaces[key] = Workspaces(partial(make, tree, curves, sizes, self.real))
         return self._workspaces[key]
 
     def _view(self, cost: TrackingCost, past: FrameContext, context: FrameContext) -> _Found:
@@ -416,7 +420,8 @@ class FusedEngine:
         )
         interior = view.flow.nodes.shape[2]
         keypoints = 64 * math.ceil(len(view.keypoints.row) / 64)  # for all of these one memory
-        memory = self._memory(tree, view.curves, interior, 1, len(edges.steps), keypoints)
+        sizes = interior, 1, len(edges.steps), keypoints
+        memory = self._memory(pack.make_workspace, tree, view.curves, *sizes)
         packed = _Packed(
             add_view, add_held_view, len(view.flow.target), (tree, parts, view), memory
         )
@@ -454,6 +459,7 @@ def _rows(parent: Array | None, modes: int, size: int) -> Array:
     """The mode that each sample is compared with, where there are several."""
     if parent is None or modes == 1:
         return np.zeros(size, np.int64)
-    if len(parent) and not 0 <= parent.min() <= parent.max() < modes:
+    # Without a sign a negative one is larger than any other.
+    if len(parent) and not parent.view(np.uint64).max() < modes:
         raise IndexError(f"parent: expected modes 0 to {modes - 1}, got {parent.max()}")
     return parent

@@ -37,6 +37,7 @@ from torchcss.cost.fused.records import (
     Mixture,
     Nodes,
     PackedKeypoints,
+    PairScratch,
     Parts,
     Peaks,
     Points,
@@ -68,7 +69,7 @@ _Record = TypeVar("_Record", bound=tuple[Any, ...])
 
 def array(tensor: Tensor, real: Real = np.float64) -> Array:
     """A tensor as contiguous numbers of a type."""
-    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=real)
+    return np.ascontiguousarray(tensor.numpy(force=True), dtype=real)
 
 
 def in_precision(record: _Record, real: Real) -> _Record:
@@ -366,6 +367,14 @@ def make_workspace(tree: Tree, curves: Curves, sizes: tuple[int, ...], real: Rea
         peaks=fields(Peaks, nodes * (steps // 2)),
         response=np.zeros(nodes * steps, real),
     )
+
+
+def make_pair_scratch(
+    tree: Tree, curves: Curves, sizes: tuple[int, ...], real: Real
+) -> PairScratch:
+    """Memory for the repulsion of one state; see `make_workspace`."""
+    whole = make_workspace(tree, curves, sizes, real)._asdict()
+    return PairScratch(*(whole[name] for name in PairScratch._fields))
 
 
 def pack_limbs(body: BodyModel, density: BodyDensity) -> Limbs:

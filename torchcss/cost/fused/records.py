@@ -415,3 +415,9 @@ Attributes:
     peaks: Edges beside them.
     response: Responses along the search lines of all nodes.
 """
+
+
+PairScratch = namedtuple(
+    "PairScratch", "frames frame posed reference twists moved sums lines points"
+)
+"""The part of a `Workspace` that pairs of parts need: what is passed to a kernel takes its time."""

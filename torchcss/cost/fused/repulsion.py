@@ -14,12 +14,12 @@ from torchcss.cost.fused.projection import Spatial, read_point, write_point
 from torchcss.cost.fused.records import (
     Array,
     Lines,
+    PairScratch,
     Parts,
     Points,
     Repulsion,
     Result,
     Tree,
-    Workspace,
 )
 from torchcss.cost.fused.superquadric import (
     as_spatial,
@@ -39,7 +39,7 @@ def add_repulsion(
     parts: Parts,
     repulsion: Repulsion,
     exact: bool,
-    workspace: Workspace,
+    scratch: PairScratch,
     result: Result,
 ) -> None:
     """Add the repulsion of all states of a pool.
@@ -50,33 +50,33 @@ def add_repulsion(
         parts: Its parts.
         repulsion: The term.
         exact: Whether the curvature of the kinematics counts.
-        workspace: Memory for what is found on the way.
+        scratch: Memory for what is found on the way.
         result: Where it is added.
     """
     slopes = len(result.gradient[0]) > 0
     for b in range(len(x)):
-        pose_tree(x[b], tree, workspace.frames)
-        pose_parts(workspace.frames, parts, workspace.frame, workspace.posed)
-        workspace.reference[:] = 0.0
+        pose_tree(x[b], tree, scratch.frames)
+        pose_parts(scratch.frames, parts, scratch.frame, scratch.posed)
+        scratch.reference[:] = 0.0
         if slopes:
-            find_twists(workspace.frames, tree, workspace.reference, workspace.twists)
-        found = _find_nodes(repulsion, workspace.posed, workspace.lines)
-        _measure(repulsion.shape, workspace.lines, found)
+            find_twists(scratch.frames, tree, scratch.reference, scratch.twists)
+        found = _find_nodes(repulsion, scratch.posed, scratch.lines)
+        _measure(repulsion.shape, scratch.lines, found)
         if not slopes:
             for m in range(found):
-                result.value[b] += potential(repulsion, workspace.lines.value[m])[0]
+                result.value[b] += potential(repulsion, scratch.lines.value[m])[0]
             continue
         gradient, hessian = result.gradient[b], result.hessian[b]
-        found = _felt(workspace.lines, found, repulsion.reach)
-        _curve(repulsion.shape, workspace.lines, found, workspace.points)
+        found = _felt(scratch.lines, found, repulsion.reach)
+        _curve(repulsion.shape, scratch.lines, found, scratch.points)
         m = 0
         while m < found:
-            begin, pair = m, workspace.lines.ray[m]
-            cost, m = _push(repulsion, workspace, m, found)
+            begin, pair = m, scratch.lines.ray[m]
+            cost, m = _push(repulsion, scratch, m, found)
             result.value[b] += cost
-            workspace.sums[0] = 0.0
-            sum_points(workspace.points, begin, m, workspace.reference, workspace.sums[0])
-            _lift_pair(tree, repulsion, pair, exact, workspace, gradient, hessian)
+            scratch.sums[0] = 0.0
+            sum_points(scratch.points, begin, m, scratch.reference, scratch.sums[0])
+            _lift_pair(tree, repulsion, pair, exact, scratch, gradient, hessian)
 
 
 @kernel
@@ -180,12 +180,12 @@ def _curve(table: Array, lines: Lines, found: int, points: Points) -> None:
 
 
 @kernel
-def _push(repulsion: Repulsion, workspace: Workspace, m: int, found: int) -> tuple[float, int]:
+def _push(repulsion: Repulsion, scratch: PairScratch, m: int, found: int) -> tuple[float, int]:
     """The next pair: its cost and where it ends. Its points get the cost's derivatives."""
-    lines, points, total, pair = workspace.lines, workspace.points, 0.0, workspace.lines.ray[m]
-    frame = workspace.posed[lines.part[m]]
+    lines, points, total, pair = scratch.lines, scratch.points, 0.0, scratch.lines.ray[m]
+    frame = scratch.posed[lines.part[m]]
     for i in range(3):
-        workspace.reference[i] = frame[i, 3]
+        scratch.reference[i] = frame[i, 3]
     while m < found and lines.ray[m] == pair:
         x, y, z = points.x[m], points.y[m], points.z[m]
         value, first, second = potential(repulsion, lines.value[m])
@@ -271,15 +271,15 @@ def _lift_pair(
     repulsion: Repulsion,
     pair: int,
     exact: bool,
-    workspace: Workspace,
+    scratch: PairScratch,
     gradient: Array,
     hessian: Array,
 ) -> None:
     """Add the derivatives of a pair's cost in the state."""
-    cx, cy, cz = workspace.reference[0], workspace.reference[1], workspace.reference[2]
+    cx, cy, cz = scratch.reference[0], scratch.reference[1], scratch.reference[2]
     chain, signs = repulsion.chain[pair], repulsion.sign[pair]
     for n in range(len(chain)):
-        joint, twist = workspace.twists[chain[n]], workspace.moved[n]
+        joint, twist = scratch.twists[chain[n]], scratch.moved[n]
         factor = signs[n] * tree.factor[chain[n]]
         if signs[n] == 0.0:
             return
@@ -288,11 +288,11 @@ def _lift_pair(
         twist[3] = factor * (joint[3] + wy * cz - wz * cy)
         twist[4] = factor * (joint[4] + wz * cx - wx * cz)
         twist[5] = factor * (joint[5] + wx * cy - wy * cx)
-        slope, turning, shifting = react(workspace.sums[0], twist, 1.0 if exact else 0.0)
+        slope, turning, shifting = react(scratch.sums[0], twist, 1.0 if exact else 0.0)
         column = tree.column[chain[n]]
         gradient[column] += slope
         for m in range(n + 1):
-            t, other = workspace.moved[m], tree.column[chain[m]]
+            t, other = scratch.moved[m], tree.column[chain[m]]
             bend = t[0] * turning[0] + t[1] * turning[1] + t[2] * turning[2]
             bend += t[3] * shifting[0] + t[4] * shifting[1] + t[5] * shifting[2]
             hessian[other, column] += bend
