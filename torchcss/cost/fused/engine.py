@@ -422,10 +422,8 @@ class FusedEngine:
         keypoints = 64 * math.ceil(len(view.keypoints.row) / 64)  # for all of these one memory
         sizes = interior, 1, len(edges.steps), keypoints
         memory = self._memory(pack.make_workspace, tree, view.curves, *sizes)
-        packed = _Packed(
-            add_view, add_held_view, len(view.flow.target), (tree, parts, view), memory
-        )
-        return [packed], frozenset(others)
+        modes, packed = len(view.flow.target), (tree, parts, view)
+        return [_Packed(add_view, add_held_view, modes, packed, memory)], frozenset(others)
 
     def _pack_image(self, term: Any, bound: OnPoints, context: FrameContext) -> Any:
         """The record of an image term, without its weight; None: its twin does not know it."""
