@@ -16,12 +16,14 @@ from urllib.parse import unquote
 
 import pytest
 
-from torchcss.app.batch import Batch, Job, go_on_from, read_manifest, track_claimed
+from torchcss.app.batch import Batch, Job, _Watch, go_on_from, read_manifest, track_claimed
 from torchcss.app.claims import Claims
+from torchcss.app.recorder import Picture
 from torchcss.errors import ConfigurationError
-from torchcss.io.checkpoint import Checkpoint, write_checkpoint
+from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from torchcss.io.run import Run
 from torchcss.studies.demo import CLIP
+from torchcss.tracking.session import Posterior
 from torchcss.tracking.settings import Settings
 
 SETTINGS = Settings(body="arm8", samples=4, modes=2, keypoints_use="first", overlay=False)
@@ -138,6 +140,27 @@ def test_who_was_taken_over_says_nothing_of_the_clip(tmp_path: Path) -> None:
     assert job.claims.take("a") is not None
     track_claimed(job, clip, claim)
     assert job.failure(clip) is None
+
+
+def test_who_was_taken_over_writes_no_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest, out = write_manifest(tmp_path, {"name": "a", "stop": 3}), tmp_path / "out"
+    job = Job.begin(Batch(manifest=manifest, out=out, settings=SETTINGS))
+    claim, add = job.claims.take("a"), _Watch.add
+
+    def sleep(watch: _Watch, frame: Posterior, picture: Picture) -> None:
+        if frame.frame.index == 1:
+            assert job.claims.take("a", gone=True) is not None
+        add(watch, frame, picture)
+
+    monkeypatch.setattr(_Watch, "add", sleep)
+    assert claim is not None
+    track_claimed(job, job.clips[0], claim)
+    left = read_checkpoint(out / ".batch" / "work" / "a" / "1")
+    assert left is not None
+    assert left.num_frames == 1
+    assert job.is_left(job.clips[0])
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,6 +37,34 @@ def test_one_of_several_gets_it(tmp_path: Path) -> None:
     seen = second.sight("clip.a")
     assert seen is not None
     assert (seen.counter, seen.progress) == (2, "40 %")
+
+
+def test_a_file_system_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sticks, of some network shares."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "link", refuse)
+    assert Claims(tmp_path).take("a") is not None
+    assert Claims(tmp_path).take("a") is None
+
+
+def test_a_disk_that_has_no_room_for_a_name_leaves_no_claim(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would count as that of an owner who died."""
+
+    def refuse(_: int) -> str:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as context:
+        context.setattr("torchcss.app.claims.process_name", refuse)
+        with pytest.raises(OutputError, match="disk is full"):
+            Claims(tmp_path).take("a")
+    claim = Claims(tmp_path).take("a")
+    assert claim is not None
+    assert claim.generation == 1
 
 
 def test_names_may_hold_any_sign(tmp_path: Path) -> None:
@@ -69,6 +100,10 @@ def test_who_lives_keeps_it_and_who_stands_still_is_taken_over(tmp_path: Path) -
     assert taken is not None
     assert taken.generation == 2
     assert not claim.holds
+    before = (tmp_path / "a" / "1").read_text()
+    claim.beat("50 %")
+    claim.release()
+    assert (tmp_path / "a" / "1").read_text() == before, "it has nothing to say any more"
 
 
 def test_a_clock_that_jumps_back_takes_nothing_over(tmp_path: Path) -> None:

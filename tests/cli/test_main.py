@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_clip import track
+from made_processes import begin
 
+from torchcss.app.recorder import Terminated
 from torchcss.cli import main as cli
 
 
@@ -180,6 +182,30 @@ def test_interrupt_has_its_own_status(files: Path, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("torchcss.cli.track.track_video", interrupted)
     assert track(files) == 130
+
+
+@pytest.mark.parametrize(("verb", "status"), [("track", 143), ("batch", 0)])
+def test_a_request_to_end_has_its_own_status(
+    verb: str, status: int, monkeypatch: pytest.MonkeyPatch
+):
+    def ended(_verb: object) -> None:
+        raise Terminated
+
+    monkeypatch.setattr({"track": cli.Track, "batch": cli.Batch}[verb], "run", ended)
+    assert cli.main([verb, "a"]) == status
+
+
+@pytest.mark.parametrize("program", ["torchcss.cli.main", "torchcss.app.batch"])
+def test_the_end_of_the_process_counts_no_references(program: str):
+    """Which took most of a second of the ten that a scheduler leaves."""
+    begun = begin(
+        "import atexit, gc, importlib, sys\n"
+        "try:\n    importlib.import_module(sys.argv[1]).main(['--help'])\n"
+        "except SystemExit:\n    atexit._run_exitfuncs(); tell(gc.get_freeze_count())\n",
+        program,
+    )
+    assert begun.told.recv() > 0
+    begun.end()
 
 
 @pytest.mark.parametrize(

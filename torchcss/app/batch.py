@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import atexit
 import csv
+import gc
 import html
 import io
 import json
@@ -611,7 +612,7 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
         settings=settings_from_plain({**asdict(job.settings), **own}),
         start=begin,
         stop=end,
-        options=TrackOptions(live=watch, resume=True, **options),
+        options=TrackOptions(live=watch, claim=watch.claim, resume=True, **options),
     )
 
 
@@ -670,6 +671,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """One process of a batch, for `torchrun` and schedulers."""
     # Once all is written, a request to end changes nothing: the process is about to.
     atexit.register(signal.signal, signal.SIGTERM, signal.SIG_IGN)
+    atexit.register(gc.freeze)  # the interpreter's end is five times as fast
     try:
         with ended_by_sigterm():
             tyro.cli(Batch, args=arguments, description=__doc__).run()

@@ -1,12 +1,13 @@
 """Who works on what, told by files alone: for processes of many machines that share a folder.
 
-A claim is a file `NAME/GENERATION`, made by one exclusive act (a hard link of a file that is
-complete, which network file systems honour): of several that try, one succeeds. Its owner shows
-that it lives by adding lines; their number is a counter, and the last one says how far it is. A
-claim whose counter stands still, as long as another process watches it by a clock of its own, may
-be taken over: by a claim of the next generation. Clocks of two machines are never compared. An
-owner that wakes up finds the newer generation, and has to write nothing more. Whoever knows that an
-owner is dead, because it started that process, says so in its claim, and nobody has to wait.
+A claim is a file `NAME/GENERATION`, made by one exclusive act (it is created only where there is
+none, which network file systems honour): of several that try, one succeeds. Its owner writes its
+name into it, and shows that it lives by adding lines; their number is a counter, and the last one
+says how far it is. A claim whose counter stands still, as long as another process watches it by a
+clock of its own, may be taken over: by a claim of the next generation. Clocks of two machines are
+never compared. An owner that wakes up finds the newer generation, and has to write nothing more.
+Whoever knows that an owner is dead, because it started that process, says so in its claim, and
+nobody has to wait.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import os
 import socket
 import threading
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -76,9 +76,11 @@ class WorkClaim:
         return seen is not None and seen.generation == self.generation
 
     def beat(self, progress: str) -> None:
-        """Show that the owner lives, and how far it is."""
-        with suppress(OSError), self._path.open("a", encoding="utf-8") as file:
-            file.write(progress + "\n")
+        """Show that the owner lives, and how far it is; of no use to who was taken over."""
+        with suppress(OSError):
+            if self.holds:
+                with self._path.open("a", encoding="utf-8") as file:
+                    file.write(progress + "\n")
 
     def release(self) -> None:
         """Let it go: the next one may claim at once."""
@@ -133,7 +135,7 @@ class Claims:
             lines = (place / str(generation)).read_text(encoding="utf-8").splitlines()
         except FileNotFoundError:  # or removed just now, as that of a lock is
             return None
-        # A machine that lost its power may leave an empty file.
+        # It has only just been created, or its machine lost its power then.
         owner = lines[0] if lines else "unknown"
         return Sight(generation, owner, len(lines), lines[-1] if len(lines) > 1 else "")
 
@@ -151,19 +153,21 @@ class Claims:
         if seen is not None and not (gone or seen.free or self._stands_still(name, seen)):
             return None
         generation = 1 if seen is None else seen.generation + 1
-        place = self.folder / name
-        draft = place / f".{uuid.uuid4().hex}"
+        place, path = self.folder / name, self.folder / name / str(generation)
         try:
             place.mkdir(exist_ok=True)
-            draft.write_text(process_name(os.getpid()) + "\n", encoding="utf-8")
-            os.link(draft, place / str(generation))
+            # Not by a hard link, which many file systems do not have.
+            with path.open("x", encoding="utf-8") as file:
+                try:
+                    file.write(process_name(os.getpid()) + "\n")
+                    file.flush()
+                except OSError:  # a full disk; an owner without a name would count as dead
+                    path.unlink()
+                    raise
         except FileExistsError:
             return None
         except OSError as error:
             raise output_error(place, error) from error
-        finally:
-            with suppress(OSError):
-                draft.unlink(missing_ok=True)
         return WorkClaim(self, name, generation)
 
     def tell_dead(self, name: str, seen: Sight) -> None:

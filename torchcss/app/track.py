@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import islice
@@ -80,6 +81,8 @@ class TrackOptions:
         resume: Go on with what an interrupted run of the same settings left in the folder; start
             where there is nothing.
         checkpoint_every: Seconds of wall time between checkpoints.
+        claim: What has to hold before each checkpoint, so that nobody else writes into the folder;
+            by default its lock (`torchcss.app.lock`).
         frame_rate: Frames per second of a folder of images; None: 30.
         person: Who of several people is followed: prominent, largest, leftmost or centre in the
             first frame, or the keypoint file's number of a person.
@@ -101,6 +104,7 @@ class TrackOptions:
     live: Sink | None = None
     resume: bool = False
     checkpoint_every: float = CHECKPOINT_EVERY
+    claim: WorkClaim | None = None
     frame_rate: float | None = None
     person: str = "prominent"
     sigma: float | None = None
@@ -149,7 +153,7 @@ def track_video(
     settings, options = settings or Settings(), options or TrackOptions()
     out = prepare_output_folder(Path(out))
     selection = FrameSelection(start=start, stop=stop, stride=options.stride)
-    with locked(out) as lock:
+    with locked(out) if options.claim is None else nullcontext(options.claim) as lock:
         if options.resume and (out / TRACK_NAME).is_file():
             begun = Run.open(out)
             if begun.checkpoint is not None:
