@@ -63,6 +63,14 @@ FILES: dict[str, tuple[str, str]] = {
         "a.json", json.dumps({"mtx": K, "dist": [LENS], "resolution": [640, 480]})
     ),
     "OpenCV's XML": ("a.xml", XML),
+    "OpenCV 5, coefficients without a second axis": (
+        "a.yml",
+        OPENCV + yaml_matrix("camera_matrix", K, 3) + "distortion_coefficients: !!opencv-nd-matrix"
+        f"\n   sizes: [ 5 ]\n   dt: d\n   data: {LENS}\n",
+    ),
+    "OpenCV 5's XML, coefficients without a second axis": (
+        "a.xml", XML.replace("<rows>5</rows><cols>1</cols>", "<sizes>5</sizes>")
+    ),
     "ROS": (
         "a.yaml",
         SIZES + "camera_name: left\n" + yaml_matrix("camera_matrix", K, 3, "")

@@ -923,12 +923,11 @@ def _read_xml(path: Path) -> dict[str, Entry]:
     found: dict[str, Any] = {}
     for element in root:
         parts = {part.tag: (part.text or "").split() for part in element}
-        words = parts["data"] if {"rows", "cols", "data"} <= parts.keys() else None
         try:
-            if words is not None:
-                rows, columns = int(parts["rows"][0]), int(parts["cols"][0])
-                data = [float(word) for word in words]
-                found[element.tag] = _plain({"rows": rows, "cols": columns, "data": data})
+            if parts.get("data"):
+                sides = {side: int(parts[side][0]) for side in ("rows", "cols") if side in parts}
+                data = [float(word) for word in parts["data"]]
+                found[element.tag] = _plain({**sides, "data": data})
             else:
                 found[element.tag] = json.loads((element.text or "").strip() or "null")
         except (ValueError, IndexError):
@@ -1115,6 +1114,7 @@ _Loader.add_implicit_resolver(
     list("-+.0123456789"),
 )  # 1e-05 and -.5, which YAML's first version took for text
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+_Loader.add_constructor("tag:yaml.org,2002:opencv-nd-matrix", _matrix)  # OpenCV 5: of one axis
 _Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 
 
