@@ -18,7 +18,7 @@ from tqdm import tqdm
 from torchcss.errors import KeypointError, OutputError
 from torchcss.files import load_arrays, prepare_output_folder, save_arrays
 from torchcss.io.detect import Detected, Detector, DetectorName, open_detector
-from torchcss.io.keypoints.one_person import identified
+from torchcss.io.keypoints.one_person import colours_of, identified
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.joint_names import ALIASES
 from torchcss.types import frozen
@@ -76,7 +76,7 @@ def detect_video(
         tqdm.write("loading the detector ...", file=sys.stderr)
         detector = open_detector(options.detector, options.detector_model)
     try:
-        frames = _detected(reader, detector, masks_of(out), start)
+        frames, colours = _detected(reader, detector, masks_of(out), start)
     finally:
         detector.close()
     if not any(len(found.joints) for found in frames):
@@ -90,8 +90,11 @@ def detect_video(
     if stop is not None and len(frames) >= stop:
         end = stop
         # As many rows as the video has frames: whoever reads the file compares the two.
-        frames += [_nobody(frames[-1])] * ((reader.info.num_frames or 0) - stop)
-    write_people(out, frames, detector, size, (start, end))
+        more = (reader.info.num_frames or 0) - stop
+        frames += [_nobody(frames[-1])] * more
+        colours += [colours[-1][:0]] * more
+    ids = identified([found.joints for found in frames], colours)
+    write_people(out, frames, ids, detector, size, (start, end))
     return out
 
 
@@ -120,9 +123,16 @@ def masks_of(keypoints: Path) -> Path:
     return keypoints.with_name(f"{keypoints.stem}_masks.mp4")
 
 
-def _detected(reader: VideoReader, detector: Detector, masks: Path, start: int) -> list[Detected]:
-    """The people of every frame, nobody in those before the start; their masks go into a film."""
+def _detected(
+    reader: VideoReader, detector: Detector, masks: Path, start: int
+) -> tuple[list[Detected], list[np.ndarray]]:
+    """The people of every frame and their colours, nobody in those before the start.
+
+    Their masks go into a film.
+    """
     found: list[Detected] = []
+    colours: list[np.ndarray] = []
+    names = [name or "" for name in ALIASES[detector.layout]]
     with VideoWriter(masks, reader.info.frame_rate) as film:
         for frame in tqdm(reader, "detecting", reader.num_selected, unit="frame"):
             seen = detector.detect(frame)
@@ -132,9 +142,11 @@ def _detected(reader: VideoReader, detector: Detector, masks: Path, start: int) 
                 for _ in range(before):
                     film.write(np.full_like(mask, 255))
                 film.write(mask)
-            found += [_nobody(seen)] * before
-            found.append(seen._replace(mask=None))
-    return found
+            found += [*[_nobody(seen)] * before, seen._replace(mask=None)]
+            colours += [
+                colours_of(frame.image, each.joints, names) for each in found[len(colours) :]
+            ]
+    return found, colours
 
 
 def _nobody(like: Detected) -> Detected:
@@ -146,6 +158,7 @@ def _nobody(like: Detected) -> Detected:
 def write_people(
     out: Path,
     frames: Sequence[Detected],
+    ids: Sequence[Sequence[int]],
     detector: Detector,
     image_size_wh: tuple[int, int],
     seen: tuple[int, int],
@@ -155,11 +168,11 @@ def write_people(
     Args:
         out: The file.
         frames: The people of every frame.
+        ids: Everybody's number in every frame.
         detector: What found them.
         image_size_wh: Size of the images.
         seen: First frame given to the detector, and the one after the last or `_TO_THE_END`.
     """
-    ids = identified([found.joints for found in frames])
     count = 1 + max((number for people in ids for number in people), default=0)
     names = {name: column for column, name in enumerate(ALIASES[detector.layout]) if name}
     columns = list(names.values())

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from torchcss.errors import KeypointError
 from torchcss.io.keypoints.people import Size
@@ -54,31 +56,96 @@ class Whom(NamedTuple):
         )
 
 
-def identified(frames: list[np.ndarray]) -> list[list[int]]:
-    """Who is who in a film, by motion: a number for everybody in every frame.
+_CLOTHES = ("l_shoulder", "r_shoulder", "l_hip", "r_hip", "l_knee", "r_knee")
+_INSIDE = (0.25, 0.5, 0.75)
+_POINTS = np.array(
+    [((1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b, 0, 0) for a in _INSIDE for b in _INSIDE]
+    + [(0, 0, 1 - a, 0, a, 0) for a in _INSIDE]
+    + [(0, 0, 0, 1 - a, 0, a) for a in _INSIDE]
+)
+"""Where clothes are looked at, in the trunk and along the thighs: shares of those joints."""
 
-    Whoever is nearest to where a person was seen last, and near enough, is that person.
+_PARTS = (slice(0, 9), slice(9, 15))
+"""Which of these points lie in the trunk, which in the thighs."""
+
+_NEW = 0.1
+"""How much of what a person looks like is what the last frame shows: another may have hidden it."""
+
+
+def colours_of(
+    image: UInt8[np.ndarray, "h w 3"], people: Float[np.ndarray, "p j 3"], names: Sequence[str]
+) -> Float[np.ndarray, "p 2 3"]:
+    """Mean colours of everybody's trunk and thighs, from 0 to 1; NaN where they are not seen.
 
     Args:
-        frames: The people of every frame, `[p j 3]`.
+        image: The frame.
+        people: Everybody's joints, pixels and confidence.
+        names: What they are called; shoulders, hips and knees are needed.
     """
-    seen: dict[int, tuple[np.ndarray, int]] = {}  # by number: the last joints, and their frame
+    joints = people[:, [list(names).index(name) for name in _CLOTHES]]
+    at = (_POINTS @ joints[..., :2]).round()
+    seen = ((joints[:, None, :, 2] > 0.0) | (_POINTS == 0.0)).all(-1)
+    seen &= ((at >= 0) & (at < image.shape[1::-1])).all(-1)
+    u, v = np.moveaxis(np.where(seen[..., None], at, 0.0).astype(int), -1, 0)
+    colours = np.full((len(people), 2, 3), np.nan)
+    for person, (where, those) in enumerate(zip(seen, image[v, u] / 255.0, strict=True)):
+        for part, points in enumerate(_PARTS):
+            if where[points].any():
+                colours[person, part] = those[points][where[points]].mean(0)
+    return colours
+
+
+def identified(
+    frames: Sequence[Float[np.ndarray, "p j 3"]], colours: Sequence[Float[np.ndarray, "p 2 3"]]
+) -> list[list[int]]:
+    """Who is who in a film, by motion and appearance: a number for everybody in every frame.
+
+    Whoever is near enough to where a person was seen last, and nearest in place and colours, is
+    that person.
+
+    Args:
+        frames: The people of every frame.
+        colours: What they look like (`colours_of`).
+    """
+    known: dict[int, _Known] = {}
     numbers: list[list[int]] = []
-    for index, people in enumerate(frames):
+    for index, (people, looks) in enumerate(zip(frames, colours, strict=True)):
         pairs = sorted(
-            (_distance(last, person), number, place)
-            for number, (last, _) in seen.items()
+            (distance + _unlikeness(last.colours, looks[place]), number, place)
+            for number, last in known.items()
             for place, person in enumerate(people)
+            if (distance := _distance(last.joints, person))
+            <= _JUMP * (1.0 + 0.2 * (index - last.frame - 1))
         )
         own: dict[int, int] = {}
-        for distance, number, place in pairs:
-            reach = _JUMP * (1.0 + 0.2 * (index - seen[number][1] - 1))
-            if distance <= reach and place not in own and number not in own.values():
+        for _, number, place in pairs:
+            if place not in own and number not in own.values():
                 own[place] = number
         for place, person in enumerate(people):
-            seen[own.setdefault(place, len(seen))] = person, index
+            number = own.setdefault(place, len(known))
+            before = known[number].colours if number in known else looks[place]
+            mixed = before + _NEW * (looks[place] - before)
+            mixed = np.where(
+                np.isnan(mixed), np.where(np.isnan(before), looks[place], before), mixed
+            )
+            known[number] = _Known(person, index, mixed)
         numbers.append([own[place] for place in range(len(people))])
     return numbers
+
+
+class _Known(NamedTuple):
+    """What is known of a person: the last joints, their frame, and the colours until then."""
+
+    joints: np.ndarray
+    frame: int
+    colours: np.ndarray
+
+
+def _unlikeness(before: np.ndarray, now: np.ndarray) -> float:
+    """Mean distance of the colours of the parts that are known of both; none: 0."""
+    apart = np.sqrt(np.square(before - now).sum(-1))
+    known = apart[~np.isnan(apart)]
+    return float(known.mean()) if len(known) else 0.0
 
 
 def follow_person(
