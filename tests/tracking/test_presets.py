@@ -314,9 +314,8 @@ def test_either_potential_of_the_papers_can_be_chosen():
     assert joints.potential_kind is Lorentzian
     hidden = contour.occlusion_factor * contour.fitted_level
     assert contour.fitted_level < hidden < contour.unmatched < 0.5
-    gaussian = make_choice(Settings(preset="ijrr_gaussian_single", potential="leclerc"), 2.0)
-    assert gaussian == make_choice(Settings(preset="ijrr_gaussian_single"), 2.0)
-    assert not Settings(preset="ijrr_gaussian_single", potential="leclerc").changed()
+    with pytest.raises(ConfigurationError, match="ijrr_gaussian_single has Gaussian errors"):
+        Settings(preset="ijrr_gaussian_single", potential="leclerc")
     with pytest.raises(ConfigurationError, match="potential must be one of lorentzian, leclerc"):
         Settings(preset="ijrr_css", potential="huber")  # type: ignore[arg-type]
 

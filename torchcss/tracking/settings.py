@@ -147,7 +147,7 @@ class Settings:
             some.
         boundary_emphasis: k of `W = 1 - k S_p`, for the term `motion_boundaries`.
         potential: Robust potential of edges and flow: both papers use both of these, and do not say
-            where. Presets with Gaussian errors have none.
+            where. Not for presets with Gaussian errors.
         seed: Seed of all random numbers; the same seed gives the same track.
         device: Where to compute.
         dtype: "float64" or "float32".
@@ -205,6 +205,10 @@ class Settings:
                     raise ConfigurationError(
                         f"{name}: {self.preset} does not descend from samples; leave it out"
                     )
+        if not PRESETS[self.preset].robust and self._is_given("potential"):
+            raise ConfigurationError(
+                f"potential: {self.preset} has Gaussian errors, no robust ones; leave it out"
+            )
         check_device(self.device)
 
     def _check_names(self) -> None:
@@ -263,7 +267,6 @@ class Settings:
             **{
                 name: self._is_given(name) for name in ("samples", "modes", *_OF_SAMPLES, *_OF_COST)
             },
-            "potential": row.robust and self._is_given("potential"),
             "keypoints_use": self.keypoints_first_only != (row.keypoints_use == "first"),
             "terms": set(self.used_terms) != set(_preset_terms(row)),
             "curvature": self.curvature not in (None, row.curvature.value),
