@@ -10,6 +10,9 @@ from torch.nn import functional
 
 from torchcss.studies.render.renderer import Picture, to_bytes, value_noise
 
+PILLAR_WIDTH = 0.055
+"""Of the pillar, as a share of the picture's width."""
+
 
 def clutter_background(
     height: int, width: int, *, generator: torch.Generator, pillar: float | None = None
@@ -35,7 +38,7 @@ def clutter_background(
     painter.poster(painter.uniform(0.10, 0.22) * aspect, painter.uniform(0.54, 0.58))
     painter.shelves(painter.uniform(0.66, 0.70) * aspect, aspect * 0.97, floor)
     pillar = painter.uniform(0.56, 0.60) if pillar is None else pillar
-    painter.pillar(pillar * aspect, 0.055 * aspect)
+    painter.pillar(pillar * aspect, PILLAR_WIDTH * aspect)
     for left in (0.03, 0.30, 0.44):
         painter.carton(painter.uniform(left, left + 0.08) * aspect, painter.uniform(0.9, 0.97))
     return painter.develop()
