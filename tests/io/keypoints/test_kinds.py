@@ -695,7 +695,7 @@ def test_sleap_hdf5(tmp_path: Path) -> None:
     check(read(tmp_path / "a.analysis.h5"), (3,))
 
 
-@pytest.mark.parametrize("form", ["table", "fixed"])
+@pytest.mark.parametrize("form", ["table", "table of two kinds of numbers", "fixed"])
 @pytest.mark.parametrize("animals", [("",), ("one", "two")])
 def test_deeplabcut_hdf5(tmp_path: Path, form: str, animals: tuple[str, ...]) -> None:
     """As pandas keeps a table: its columns are pickled, or stand in levels."""
@@ -714,6 +714,20 @@ def test_deeplabcut_hdf5(tmp_path: Path, form: str, animals: tuple[str, ...]) ->
             rows = np.zeros(FRAMES, [("index", "i8"), ("values_block_0", "f8", values.shape[1])])
             rows["index"], rows["values_block_0"] = np.arange(FRAMES), values
             group["table"] = rows
+            group.attrs["non_index_axes"] = np.bytes_(pickle.dumps([(1, columns)], protocol=0))
+        elif form != "fixed":
+            cut = [column[-1] == "likelihood" for column in columns]
+            kinds = [np.flatnonzero(np.array(cut) == there) for there in (False, True)]
+            names = [f"values_block_{number}" for number in (0, 1)]
+            shapes = zip(names, ("f8", "f4"), map(len, kinds), strict=True)
+            rows = np.zeros(FRAMES, [("index", "i8"), *shapes])
+            rows["index"] = np.arange(FRAMES)
+            for name, those in zip(names, kinds, strict=True):
+                rows[name] = values[:, those]
+            group["table"] = rows
+            for name, those in zip(names, kinds, strict=True):
+                own = pickle.dumps([columns[column] for column in those], protocol=0)
+                group["table"].attrs[f"{name}_kind"] = np.bytes_(own)
             group.attrs["non_index_axes"] = np.bytes_(pickle.dumps([(1, columns)], protocol=0))
         else:
             group["block0_values"], group["axis1"] = values, np.arange(FRAMES)

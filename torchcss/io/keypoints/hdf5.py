@@ -105,10 +105,11 @@ def _read_pandas(path: Path, group: Any) -> People:
     """Read a table whose columns are scorer, maybe individual, body part and kind of number."""
     if "table" in group:
         table = _array(path, group["table"])
-        fields = table.dtype.names or ()
-        values = table[next(name for name in fields if name.startswith("values_block"))]
-        axes = io.BytesIO(bytes(group.attrs["non_index_axes"]))  # a Python object
-        columns = PlainUnpickler(axes, encoding="latin1").load()[0][1]
+        columns = _unpickled(group.attrs["non_index_axes"])[0][1]
+        names = [name for name in table.dtype.names or () if name.startswith("values_block")]
+        several = len(names) > 1
+        items = [_unpickled(group["table"].attrs[f"{name}_kind"]) for name in names if several]
+        values = _in_order(columns, [table[name] for name in names], items)
         index = table["index"].tolist()
     else:
         values, columns = _blocks(path, group), _levels(path, group, "axis0")
@@ -126,16 +127,27 @@ def _read_pandas(path: Path, group: Any) -> People:
     return people_of_rows([*enumerate([*heads, *rows], start=1)])
 
 
+def _unpickled(text: Any) -> Any:
+    """A Python object of plain containers, texts and numbers."""
+    return PlainUnpickler(io.BytesIO(bytes(text)), encoding="latin1").load()
+
+
 def _blocks(path: Path, group: Any) -> np.ndarray:
-    """The numbers of all columns, which stand in a block for every kind of number."""
+    """The numbers of all columns."""
+    keys = sorted(key for key in group if key.endswith("_values"))
+    several = len(keys) > 1
+    items = [_levels(path, group, key.replace("values", "items")) for key in keys if several]
     columns = _levels(path, group, "axis0")
-    blocks = sorted(key for key in group if key.endswith("_values"))
-    if len(blocks) == 1:
-        return _array(path, group[blocks[0]])
-    values = np.full((len(group["axis1"]), len(columns)), np.nan)
-    for key in blocks:
-        items = _levels(path, group, key.replace("values", "items"))
-        values[:, [columns.index(item) for item in items]] = _array(path, group[key])
+    return _in_order(columns, [_array(path, group[key]) for key in keys], items)
+
+
+def _in_order(columns: list[Any], blocks: list[np.ndarray], items: list[list[Any]]) -> np.ndarray:
+    """Columns that stand in a block for every kind of number, `items` naming those of each."""
+    if not items:
+        return blocks[0]
+    values = np.full((len(blocks[0]), len(columns)), np.nan)
+    for block, names in zip(blocks, items, strict=True):
+        values[:, [columns.index(name) for name in names]] = block
     return values
 
 
