@@ -133,6 +133,14 @@ def test_one_camera(tmp_path: Path, kind: str) -> None:
     check(tmp_path / name)
 
 
+def test_keypoints_are_no_calibration(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", keypoints=np.zeros((2, 17, 2)))
+    (tmp_path / "b.json").write_text(json.dumps({"people": [], "version": 1.3}))
+    for name in ("a.npz", "b.json"):
+        with pytest.raises(CameraError, match=r"keypoints, not a calibration.*--keypoints"):
+            load_camera(tmp_path / name)
+
+
 def test_pixels_of_the_board_beside_the_camera(tmp_path: Path) -> None:
     """OpenCV's program can write the board's corners, pairs in the cells of a matrix."""
     corners = yaml_matrix("image_points", [1.0] * 12, 2).replace("cols: 6", "cols: 3")

@@ -580,6 +580,8 @@ def _read_content(path: Path, content: Any, units: Any = None) -> dict[str, Entr
     inside = content if cameras is None else cameras
     cameras = _cameras_in(inside) or _matrices(inside) or cameras
     if not isinstance(cameras, dict):
+        if {"keypoints", "annotations", "people"} & content.keys():
+            raise CameraError(f"{path}: keypoints, not a calibration; give them with --keypoints")
         known = "'names' (EasyMocap), camera_matrix (OpenCV, ROS), cam0 (Kalibr) or cameras by name"
         raise unexpected(CameraError, path, known, list(content))
     for name, values in cameras.items():

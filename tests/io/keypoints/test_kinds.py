@@ -1300,6 +1300,12 @@ def test_files_of_other_kinds(tmp_path: Path, name: str, words: str) -> None:
         read(write(tmp_path / name, "a: 1"))
 
 
+@pytest.mark.parametrize("word", ["cameras", "camera_matrix"])
+def test_a_calibration_is_no_keypoints(tmp_path: Path, word: str) -> None:
+    with pytest.raises(KeypointError, match=r"a\.json: a calibration.*--camera"):
+        read(write(tmp_path / "a.json", {word: {"rows": 3, "cols": 3}, "image_width": 640}))
+
+
 # What programs of other versions write.
 
 

@@ -268,6 +268,8 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
                 frames: Frames = {float(k) if are_times else k: p for k, p in found.items()}
                 return in_seconds("t", frames) if are_times else frames
     if not isinstance(content, list):
+        if isinstance(content, dict) and {"cameras", "K", "camera_matrix"} & content.keys():
+            raise KeypointError(f"{path}: a calibration, not keypoints; give it with --camera")
         raise KeypointError(
             f"{path}: not a keypoint file; expected what a detector writes (docs/guide.md lists "
             f"the formats), found {shortened(content)}"
