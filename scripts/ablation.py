@@ -5,7 +5,9 @@
 The clips are folders as `scripts/evaluate_posterior.py` takes them. Every row tracks all of them
 with one part less, or one more or exchanged, and is compared with the first row, the default, clip
 by clip. After an error stands its difference from the default with the standard error of the mean
-over the clips: a difference below twice that is none. Runs are kept in `--runs`, a folder for each
+over the clips: a difference below twice that is none. With several seeds each figure of each clip
+is judged as well, seeds in pairs: those that are worse or better by two standard errors after
+Holm's correction are printed. Runs are kept in `--runs`, a folder for each
 row, and those that are there already are not made again.
 """
 
@@ -24,6 +26,7 @@ from common import Table, start, write_report
 from torchcss import Settings
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
+from torchcss.tracking.presets import PRESETS
 
 DEFAULT = "the default"
 KEYPOINTS = (
@@ -40,6 +43,7 @@ ROWS: dict[str, dict[str, Any]] = {
         )
     },
     "keypoints and priors alone": {"terms": KEYPOINTS},
+    "without halving": {"preset": "css, all descend"},
     "with background": {"with": "background"},
     "with silhouette": {"with": "silhouette"},
     "without recovery": {"recovery": False},
@@ -47,6 +51,11 @@ ROWS: dict[str, dict[str, Any]] = {
     "likelihood power 1": {"likelihood_power": 1.0},
 }
 """What is tracked otherwise: settings, or a term that is left out or added."""
+
+PRESETS["css, all descend"] = replace(PRESETS["css"], survivors_arm=0, survivors_body=0)
+
+TWO_ERRORS = math.erfc(math.sqrt(2))
+"""Chance of a normal number beyond two standard deviations."""
 
 ERRORS = ("PA", "best PA", "root", "best root")
 OTHERS = ("NLL", "lost", "s")
@@ -93,6 +102,7 @@ def main(config: Config) -> dict[str, Any]:
     measured: dict[str, list[dict[str, Any]]] = {}
     cells: list[list[Any]] = []
     report: dict[str, Any] = {}
+    told: dict[str, list[str]] = {}
     for name in dict.fromkeys((DEFAULT, *config.rows)):
         own = posterior.Config(
             data=config.data, runs=config.runs / name.replace(" ", "-"), smooth=False,
@@ -104,9 +114,38 @@ def main(config: Config) -> dict[str, Any]:
         head = ("tracked", *ERRORS, "cal.", *OTHERS)
         table = Table(f"{len(clips)} clips, {config.seeds} seeds", head, cells)
         table.print()
-        report = {"settings": asdict(config.tracking), "rows": measured}
+        told[name] = judged(measured[name], measured[DEFAULT])
+        print(f"{name}: {', '.join(told[name]) or 'no figure of a clip differs'}")
+        report = {"settings": asdict(config.tracking), "rows": measured, "judged": told}
         write_report(config.out, report, table)
     return report
+
+
+def judged(rows: Sequence[dict[str, Any]], default: Sequence[dict[str, Any]]) -> list[str]:
+    """Figures of clips that differ from the default's by two standard errors, as Holm counts.
+
+    Args:
+        rows: Runs of all clips and seeds.
+        default: The same runs of the default.
+    """
+    found: list[tuple[float, str]] = []
+    for clip in dict.fromkeys(row["clip"] for row in rows):
+        for name in ERRORS:
+            pairs = [(a[name], b[name]) for a, b in zip(rows, default, strict=True)
+                     if a["clip"] == clip]  # fmt: skip
+            apart = np.subtract(*np.transpose(pairs))
+            if len(apart) < 2 or not apart.any():
+                found.append((1.0, ""))
+                continue
+            error = np.std(apart, ddof=1) / math.sqrt(len(apart))
+            chance = math.erfc(abs(apart.mean()) / max(error, 1e-12) / math.sqrt(2))
+            found.append((chance, f"{clip} {name} {apart.mean():+.1f} ± {error:.1f}"))
+    kept: list[str] = []
+    for place, (chance, words) in enumerate(sorted(found)):
+        if chance * (len(found) - place) > TWO_ERRORS:
+            break
+        kept.append(words)
+    return kept
 
 
 def row_of(

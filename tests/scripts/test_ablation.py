@@ -48,6 +48,22 @@ def test_differences_are_paired_by_clip(script: ModuleType) -> None:
     assert script.row_of(default := rows(10.0, 12.0), default, 1)[0] == "11.0"
 
 
+def test_each_figure_is_judged_with_all_others(script: ModuleType) -> None:
+    def rows(*values: float) -> list[dict[str, object]]:
+        still = dict.fromkeys(script.ERRORS, 50.0)
+        return [{"clip": "one", **still, "PA": value} for value in values]
+
+    default = rows(10.0, 12.0, 11.0, 13.0)
+    assert script.judged(rows(13.0, 15.2, 14.0, 16.2), default) == ["one PA +3.1 ± 0.1"]
+    assert script.judged(rows(11.0, 9.0, 14.0, 13.5), default) == []
+    # Three standard errors of one figure of forty are none.
+    clips = [{**row, "clip": str(clip)} for clip in range(10) for row in default]
+    apart = [0.5, 1.0, 1.5, 3.0]
+    varied = [{**row, "PA": row["PA"] + step} for row, step in zip(clips, apart, strict=False)]
+    assert script.judged(varied, clips[:4])
+    assert not script.judged([*varied, *clips[4:]], clips)
+
+
 def test_rows_are_settings(script: ModuleType) -> None:
     base = Settings()
     for name in script.ROWS:
