@@ -56,10 +56,11 @@ STAGES: dict[str, tuple[Any, str]] = {
 
 REASONS = {
     "optical flow": (
-        "Pictures warped by cubic convolution are 21 million gathered values at 0.28 ns, the "
-        "solver's 7 million pixel steps take 0.57 ns each in one pass over the picture, medians "
-        "and texture 2 ms each; the rest is copies and allocations. Fewer steps are worse flow: "
-        "0.672 and 0.088 px of error on the two known pairs with 12, 0.665 and 0.088 with 16."
+        "Pictures warped by splines are 7 million gathered values, the solver takes 7 million "
+        "steps of a pixel in one pass over the picture (0.57 ns each); coefficients, texture "
+        "and changes of light are 1, 2 and 2 ms; the rest is copies and allocations. Fewer "
+        "steps are worse flow: 0.672 and 0.088 px of error on the two known pairs with 12, "
+        "0.665 and 0.088 with 16 (before changes of light were an unknown)."
     ),
     "edges": "Two blurs of 97 pixels' width; the rest is a dozen passes over the window.",
     "other features": "Shrinking the picture, and copies between whole pictures and the window.",
