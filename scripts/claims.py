@@ -260,7 +260,7 @@ def slips_there(evidence: Evidence, sequence: str, preset: str, where: Frames) -
         raise Missing(f"no run of {preset} has such frames and others before it fails")
     own, other = np.median(growths, axis=0)
     words = f"the error grows by {own:.1f} mm a frame there, by {other:.1f} elsewhere"
-    return Finding(f"{words} (of {len(growths)} runs)", own > max(0.0, 2 * other))
+    return Finding(f"{words} (of {len(growths)} runs)", bool(own > max(0.0, 2 * other)))
 
 
 def slips_at_pillar(evidence: Evidence, sequence: str, preset: str) -> Finding:
@@ -337,10 +337,14 @@ def off_silhouette(sequence: RecordedSequence, frames: list[int], places: np.nda
 
 
 def in_depth(evidence: Evidence, sequence: str, preset: str) -> Finding:
-    """Errors along the line of sight are more than twice those across it."""
-    runs = evidence.of(sequence, preset)
-    along, across = typical(runs, "along_mm"), typical(runs, "across_mm")
-    return Finding(f"{along:.0f} mm along, {across:.0f} mm across", along > 2 * across)
+    """Until a run fails, errors along the line of sight are more than twice those across it."""
+    means = []
+    for run in evidence.of(sequence, preset):
+        frames = run["per_frame"]
+        count = sum(time <= failed_s(run) for time in frames["time_s"])
+        means.append([np.mean(frames[key][:count]) for key in ("along_mm", "across_mm")])
+    along, across = np.median(means, axis=0)
+    return Finding(f"{along:.0f} mm along, {across:.0f} mm across", bool(along > 2 * across))
 
 
 def share(evidence: Evidence, sequence: str, preset: str, key: str, words: str) -> Finding:

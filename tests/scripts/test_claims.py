@@ -22,9 +22,12 @@ def run_of(preset: str, seed: int, lost_s: float | None = None, **entries: Any) 
     return {
         "preset": preset, "seed": seed, "num_frames": 3, "lost": lost_s is not None,
         "lost_s": lost_s, "limb_lost_of_modes_s": None, "root_aligned_best_of_modes_mm": 40.0,
-        "along_mm": 90.0, "across_mm": 30.0, "deep_share": 0.0, "outside_share": 0.1,
+        "deep_share": 0.0, "outside_share": 0.1,
         "deep_modes_share": 0.0,
-        "per_frame": {"time_s": times, "apart_weight": [0, 0.5, 0.1], "at_bound": [[], [], []]},
+        "per_frame": {
+            "time_s": times, "apart_weight": [0, 0.5, 0.1], "at_bound": [[], [], []],
+            "along_mm": [90.0] * 3, "across_mm": [30.0] * 3,
+        },
         **entries,
     }  # fmt: skip
 
@@ -62,7 +65,7 @@ def test_claims_are_judged(script: ModuleType, tmp_path: Path) -> None:
     runs += [run_of("ijrr_css", seed) for seed in range(2)]
     runs.append(run_of("rr_multiple_hypothesis", 0))
     seven = [run_of("rr_multiple_hypothesis", 0, lost_s=2.0)]
-    elbow = {"time_s": [0.0, 1.0, 2.0], "at_bound": [[], ["r_elbow_flexion"], []]}
+    elbow = {**runs[0]["per_frame"], "at_bound": [[], ["r_elbow_flexion"], []]}
     runs.append(run_of("ijrr_single_limits", 0, lost_s=2.0, per_frame=elbow))
     runs.append({"preset": "ijrr_css", "seed": 2, "ended": "error: it broke"})
     out = tmp_path / "claims.json"
@@ -280,6 +283,20 @@ def test_limits_and_times(script: ModuleType, tmp_path: Path) -> None:
     assert seen[longer] == ("ijrr_css: 10.0 times", "does not hold")
     most = "most of the time goes into evaluations of the cost"
     assert seen[most] == ("60 % of a frame", "holds")
+
+
+def test_depth_is_judged_by_what_was_before_the_failure(script: ModuleType, tmp_path: Path) -> None:
+    claim = "a Gaussian single mode cannot follow motion in depth (arm)"
+    for limb_lost_s, words, verdict in (
+        (1.0, "60 mm along, 20 mm across", "holds"),
+        (None, "70 mm along, 80 mm across", "does not hold"),
+    ):
+        run = run_of("ijrr_gaussian_single", 0)
+        run["limb_lost_of_modes_s"] = limb_lost_s
+        run["per_frame"] |= {"along_mm": [40, 80, 90], "across_mm": [10, 30, 200]}
+        path = report_of([run], tmp_path / "arm.json")
+        seen = verdicts(script.main(script.Config(failures=(path,))))
+        assert seen[claim] == (words, verdict)
 
 
 def test_weights_help_where_the_error_is_less(script: ModuleType, tmp_path: Path) -> None:
