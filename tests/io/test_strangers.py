@@ -295,6 +295,32 @@ def test_meshes_and_includes_stay_in_the_folder(tmp_path: Path) -> None:
         assert load_body(folder / "a.urdf").part_names == (), name
 
 
+@pytest.mark.parametrize("suffix", [".urdf", ".bvh", ".xml"])
+def test_bodies_of_very_many_links(tmp_path: Path, suffix: str) -> None:
+    """A few megabytes of them took hours, and gigabytes of memory."""
+    path, number = tmp_path / f"a{suffix}", 3000
+    if suffix == ".urdf":
+        lines = [f"<link name='{i}'/>" for i in range(number + 1)]
+        lines += [
+            f"<joint name='j{i}' type='fixed'><parent link='0'/><child link='{i}'/></joint>"
+            for i in range(1, number + 1)
+        ]
+        path.write_text(f"<robot name='a'>{''.join(lines)}</robot>")
+    elif suffix == ".xml":
+        pytest.importorskip("mujoco")
+        solid = "<joint/><geom size='1'/>"
+        many = f"<replicate count='{number}'><body>{solid}</body></replicate>"
+        path.write_text(f"<mujoco><worldbody><body>{solid}{many}</body></worldbody></mujoco>")
+    else:
+        turns = "OFFSET 0 1 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
+        links = (
+            f"JOINT j{i}\n{{\n{turns}End Site\n{{\nOFFSET 0 1 0\n}}\n}}\n" for i in range(number)
+        )
+        text = f"HIERARCHY\nROOT a\n{{\n{turns}{''.join(links)}}}\nMOTION\nFrames: 0\n"
+        path.write_text(f"{text}Frame Time: 0.1\n")
+    assert "links; expected" in refused(load_body, path)
+
+
 def test_meshes_are_of_a_links_size(tmp_path: Path) -> None:
     (tmp_path / "a.urdf").write_text(
         "<robot name='a'><link name='b'><visual><geometry><mesh filename='a.stl'/>"

@@ -39,6 +39,7 @@ from torchcss.body.catalog import (
 )
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import HungTree, read_bvh_skeleton
+from torchcss.body.files.bvh_parser import MOST_LINKS
 from torchcss.body.files.default_shape import bone_parts, rest_poses, touching_parts, unused
 from torchcss.body.files.mjcf import read_mjcf
 from torchcss.body.files.urdf import read_urdf
@@ -158,6 +159,8 @@ def has_free_root(name_or_path: str | Path) -> bool:
 def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> BodySpecification:
     """Joints, parts and landmarks of a file, hung on a root if it has or shall have one."""
     skeleton, solids, turn = _read(path, options.units)
+    if (number := len(skeleton.joints)) > MOST_LINKS:  # of an MJCF, which may repeat its bodies
+        raise BodyError(f"{number:,} links; expected a robot of {MOST_LINKS:,} at most")
     if skeleton.has_root if free_root is None else free_root:
         root, base = root_joints(), skeleton.joints[0]
         # The root moves the first body that the file names, wherever the file puts that.

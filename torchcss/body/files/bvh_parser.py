@@ -56,6 +56,9 @@ class Segment(NamedTuple):
 _DEFAULT_RATE = 30.0
 """Frames per second of a motion that has none, or one without a time."""
 
+MOST_LINKS = 2000
+"""Links of a body: time and memory grow with their square."""
+
 _HUGE = 1e12
 """No length or angle of a body is so large, in any unit."""
 
@@ -198,6 +201,10 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
         segments.append(Segment(name, parent, offset, np.eye(3), turns, False))
         stack.append(len(segments) - 1)
         allowed = ("JOINT", "END", "}")
+    if len(segments) > MOST_LINKS:
+        raise MotionCaptureError(
+            f"{path}: {len(segments):,} links; expected a skeleton of {MOST_LINKS:,} at most"
+        )
     values, rate = _bvh_frames(path, lines[motion:], np.array(columns, dtype=bool))
     return segments, values, rate
 

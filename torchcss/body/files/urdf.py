@@ -28,6 +28,7 @@ from jaxtyping import Float
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order
 from torchcss.body.files.bvh import HungTree
+from torchcss.body.files.bvh_parser import MOST_LINKS
 from torchcss.body.files.default_shape import solid_shape, unopened_meshes
 from torchcss.body.files.mesh import MESH_SUFFIXES, mesh_points
 from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows, as_vector
@@ -158,6 +159,8 @@ def _check_links(robot: ElementTree.Element, joints: Mapping[str, ElementTree.El
         [_link(element, tag) for element in joints.values()] for tag in ("child", "parent")
     )
     links = [link.get("name", "") for link in robot.findall("link")]
+    if len(links) > MOST_LINKS:
+        raise BodyError(f"{len(links):,} links; expected a robot of {MOST_LINKS:,} at most")
     unknown = {*children, *parents} - set(links)
     if unknown:
         raise BodyError(f"joints name links that do not exist: {sorted(unknown)}")
