@@ -150,6 +150,22 @@ def test_a_video_alone_is_tracked(
     assert "as given" in notes
 
 
+def test_a_video_is_tracked_from_where_somebody_is_seen(
+    files: Path, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crowd.places[0] = []
+    monkeypatch.setattr("torchcss.app.detect.open_detector", lambda *_: crowd)
+    settings = torchcss.Settings(body="arm7", samples=3, modes=2, overlay=False)
+    options = torchcss.TrackOptions(person="leftmost", fov=60.0)
+    video, out = files / "video.mp4", files / "out"
+    run = torchcss.track_video(video, out=out, settings=settings, options=options, stop=2)
+    assert run.track.frames.tolist() == [1]
+    assert "nobody is seen in frame 0: tracked from frame 1 on" in run.summary["notes"]
+    again = replace(options, resume=True)
+    run = torchcss.track_video(video, out=out, settings=settings, options=again)
+    assert run.track.frames.tolist() == [1, 2]
+
+
 @pytest.mark.parametrize(
     ("options", "settings", "words"),
     [({"fov": 200.0}, {}, "--fov"), ({"masks": Path("none.mp4")}, {}, "none.mp4"),

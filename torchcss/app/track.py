@@ -16,6 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -32,12 +33,13 @@ from torchcss.body.root import has_root
 from torchcss.errors import (
     CameraError,
     ConfigurationError,
+    KeypointError,
     OutputError,
     TrackFileError,
     check_positive,
     check_range,
 )
-from torchcss.files import StrPath, make_paths, naming, prepare_output_folder
+from torchcss.files import StrPath, load_arrays, make_paths, naming, prepare_output_folder
 from torchcss.initialise.noise import Noise
 from torchcss.initialise.options import LEAST_JOINTS
 from torchcss.initialise.result import Initialisation, check_stature, stature_of
@@ -158,7 +160,7 @@ def track_video(
             begun = Run.open(out)
             if begun.checkpoint is not None:
                 begun = _with_files(begun, Path(video), camera, keypoints, options)
-                return _go_on(begun, settings, selection, options, lock)
+                return _go_on(begun, settings, _moved_again(begun, selection), options, lock)
         # What is wrong is told before the detector runs, which may take long.
         body = load_body(settings.body) if options.first is None else options.first.body
         check_stature(settings.body, settings.stature)
@@ -167,7 +169,13 @@ def track_video(
         source, is_known = _camera_of(Path(video), camera, options, start)
         files = _files_of(Path(video), keypoints, options)
         files = _with_keypoints(files, source, out, selection, options)
+        if keypoints is None and options.init is None and options.first is None:
+            selection = _from_somebody(out / _KEYPOINTS_NAME, selection)
         views = _all_views(files, source, selection, options, body.joint_of_name)
+        if selection.start != start:
+            views[0] = views[0].noted(
+                f"nobody is seen in frame {start}: tracked from frame {selection.start} on"
+            )
         if not is_known:
             _now("fitting the focal length to the keypoints")
             views = [fitted(views[0], settings)]
@@ -272,6 +280,45 @@ def _with_keypoints(
     return replace(files, keypoints=keypoints, masks=masks)
 
 
+_WELL_SEEN = 0.7
+"""Share of the usual confidence with which somebody is seen well enough to start from."""
+
+
+def _from_somebody(keypoints: Path, selection: FrameSelection) -> FrameSelection:
+    """The frames from the first one on that shows somebody well, where the first shows nobody.
+
+    Args:
+        keypoints: What was detected.
+        selection: The frames that are asked for.
+    """
+    people = load_arrays(keypoints, KeypointError)["confidence"].sum(-1)
+    belief = people.max(1)[selection.start : selection.stop]
+    if belief[0] > 0.0:
+        return selection
+    later = np.flatnonzero(belief >= _WELL_SEEN * np.median(belief[belief > 0.0]))
+    return replace(selection, start=selection.start + int(later[0]))
+
+
+def _moved_again(begun: Run, selection: FrameSelection) -> FrameSelection:
+    """The frames with the start of a run that began later, where somebody was seen."""
+    assert begun.checkpoint is not None
+    known = begun.checkpoint.notes["extra"]["frames_selected"]["start"]
+    keypoints = _detected_by(begun)
+    if keypoints is None or known <= selection.start:
+        return selection
+    nobody = not load_arrays(keypoints, KeypointError)["confidence"][selection.start].any()
+    return replace(selection, start=known) if nobody else selection
+
+
+def _detected_by(run: Run) -> Path | None:
+    """The keypoints that a run detected itself; None: they were given."""
+    own = run.cameras[0].files
+    if own is None or own.keypoints is None:
+        return None
+    found = (run.folder / _KEYPOINTS_NAME).resolve()
+    return own.keypoints if own.keypoints.resolve() == found else None
+
+
 def _check_for_detector(body: BodyModel) -> None:
     """Refuse to look for people where the body is none."""
     if len(set(body.joint_names) & set(JOINT_NAMES)) < LEAST_JOINTS:
@@ -292,12 +339,9 @@ def _detect(video: Path, keypoints: Path, selection: FrameSelection, options: Tr
 
 def _detect_further(run: Run, selection: FrameSelection, options: TrackOptions) -> None:
     """Find the keypoints anew where a run goes on beyond the frames that were looked at."""
-    own = run.cameras[0].files
-    found = (run.folder / _KEYPOINTS_NAME).resolve()
-    if own is None or own.keypoints is None or own.keypoints.resolve() != found:
-        return
-    if not is_detected(own.keypoints, selection.stop):
-        _detect(own.video, own.keypoints, selection, replace(options, frame_rate=own.frame_rate))
+    own, keypoints = run.cameras[0].files, _detected_by(run)
+    if own is not None and keypoints is not None and not is_detected(keypoints, selection.stop):
+        _detect(own.video, keypoints, selection, replace(options, frame_rate=own.frame_rate))
 
 
 def _camera_of(

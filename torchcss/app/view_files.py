@@ -57,6 +57,12 @@ class OpenView(NamedTuple):
         sigma = factor * self.sigma
         return self._replace(files=replace(self.files, sigma=sigma), sigma=sigma)
 
+    def noted(self, line: str) -> OpenView:
+        """The same with a line more to say of its keypoints."""
+        assert self.keypoints is not None
+        report = (line, *self.keypoints.report)
+        return self._replace(keypoints=self.keypoints._replace(report=report))
+
     @property
     def recorded(self) -> RecordedCamera:
         """The camera with its files, as a run holds it."""
