@@ -201,12 +201,9 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
         segments.append(Segment(name, parent, offset, np.eye(3), turns, False))
         stack.append(len(segments) - 1)
         allowed = ("JOINT", "END", "}")
-    if len(segments) > MOST_LINKS:
-        raise MotionCaptureError(
-            f"{path}: {len(segments):,} links; expected a skeleton of {MOST_LINKS:,} at most"
-        )
-    values, rate = _bvh_frames(path, lines[motion:], np.array(columns, dtype=bool))
-    return segments, values, rate
+    if (number := len(segments)) > MOST_LINKS:
+        raise MotionCaptureError(f"{path}: {number:,} links; expected {MOST_LINKS:,} at most")
+    return segments, *_bvh_frames(path, lines[motion:], np.array(columns, dtype=bool))
 
 
 def without_empty_positions(
