@@ -18,6 +18,7 @@ from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
+from torchcss.io.video import VideoWriter
 from torchcss.io.view_files import ViewFiles
 from torchcss.types import Frame, Keypoints
 from torchcss.vision.camera import Camera
@@ -164,6 +165,21 @@ def test_a_video_is_tracked_from_where_somebody_is_seen(
     again = replace(options, resume=True)
     run = torchcss.track_video(video, out=out, settings=settings, options=again)
     assert run.track.frames.tolist() == [1, 2]
+
+
+def test_somebody_who_is_not_there_for_long_is_no_start(
+    files: Path, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crowd.places = [[], [(8.0, 10.0, 6.0)], [(48.0, 24.0, 9.0)], [(48.0, 24.0, 9.0)]]
+    with VideoWriter(files / "longer.mp4", 25) as film:
+        for _ in range(4):
+            film.write(np.zeros((*SIZE[::-1], 3), np.uint8))
+    monkeypatch.setattr("torchcss.app.detect.open_detector", lambda *_: crowd)
+    settings = torchcss.Settings(body="arm7", samples=3, modes=2, overlay=False)
+    options = torchcss.TrackOptions(fov=60.0)
+    video, out = files / "longer.mp4", files / "out"
+    run = torchcss.track_video(video, out=out, settings=settings, options=options)
+    assert run.track.frames.tolist() == [2, 3]
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def track_video(
         files = _files_of(Path(video), keypoints, options)
         files = _with_keypoints(files, source, out, selection, options)
         if keypoints is None and options.init is None and options.first is None:
-            selection = _from_somebody(out / _KEYPOINTS_NAME, selection)
+            selection = _from_somebody(out / _KEYPOINTS_NAME, selection, options.person)
         views = _all_views(files, source, selection, options, body.joint_of_name)
         if selection.start != start:
             views[0] = views[0].noted(
@@ -284,18 +284,27 @@ _WELL_SEEN = 0.7
 """Share of the usual confidence with which somebody is seen well enough to start from."""
 
 
-def _from_somebody(keypoints: Path, selection: FrameSelection) -> FrameSelection:
-    """The frames from the first one on that shows somebody well, where the first shows nobody.
+def _from_somebody(keypoints: Path, selection: FrameSelection, person: str) -> FrameSelection:
+    """The frames from the first one on that shows a person well, where the first shows nobody.
+
+    The person is the one who is asked for by number, or who is seen most in all: a detector sees
+    somebody who is not there for a few frames.
 
     Args:
         keypoints: What was detected.
         selection: The frames that are asked for.
+        person: Who is asked for.
     """
-    people = load_arrays(keypoints, KeypointError)["confidence"].sum(-1)
-    belief = people.max(1)[selection.start : selection.stop]
-    if belief[0] > 0.0:
+    arrays = load_arrays(keypoints, KeypointError)
+    belief = arrays["confidence"].sum(-1)[selection.start : selection.stop]
+    if belief[0].any():
         return selection
-    later = np.flatnonzero(belief >= _WELL_SEEN * np.median(belief[belief > 0.0]))
+    numbers = arrays["person_ids"].astype(str).tolist()
+    most = numbers.index(person) if person in numbers else int(belief.sum(0).argmax())
+    own = belief[:, most]
+    if not own.any():
+        return selection
+    later = np.flatnonzero(own >= _WELL_SEEN * np.median(own[own > 0.0]))
     return replace(selection, start=selection.start + int(later[0]))
 
 
