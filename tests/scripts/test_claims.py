@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -121,6 +122,21 @@ def test_claims_are_judged(script: ModuleType, tmp_path: Path) -> None:
     assert sum(report["counts"].values()) == len(script.CLAIMS)
     written = json.loads(out.read_text())
     assert len(written["table"]["rows"]) == len(script.CLAIMS)
+
+
+def test_every_claim_has_a_row_on_the_page(script: ModuleType) -> None:
+    reports = Path(__file__).resolve().parents[2] / "docs" / "results"
+    page = json.loads((reports / "claims.json").read_text(encoding="utf-8"))
+    rows = page["table"]["rows"]
+    told = [(claim.words, claim.section, f"scripts/{claim.script}") for claim in script.CLAIMS]
+    assert [tuple(row["cells"][:3]) for row in rows] == told
+    verdicts_told = [row["cells"][4] for row in rows]
+    assert page["counts"] == {each: verdicts_told.count(each) for each in page["counts"]}
+    assert sum(page["counts"].values()) == len(rows)
+    for row in rows:
+        assert re.fullmatch("[0-9a-f]{7,}", row["version"]), f"no commit: {row['version']}"
+        if row["cells"][4] == "not tested":
+            assert row["cells"][3].startswith("because "), row["cells"]
 
 
 def test_several_modes_while_the_body_moves_in_depth(script: ModuleType, tmp_path: Path) -> None:
