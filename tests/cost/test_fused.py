@@ -190,6 +190,8 @@ x = awkward_states(cost, torch.Generator().manual_seed(0))[[0, 7, 9]]
 for each in (cost, printed_cost(cost, "ijrr_css"), printed_cost(cost, "ijrr_gaussian_single")):
     assert_close(each, x, "float64")
     assert_close(each, x, "float32")
+cost = colours_of(make_full_cost("body34"))  # a root, and parts that hide others
+assert_close(cost, awkward_states(cost, torch.Generator().manual_seed(0))[[8]], "float32")
 print("checked")
 """
 
