@@ -43,8 +43,8 @@ def triangles(size: int, new: int) -> tuple[np.ndarray, np.ndarray]:
     weight /= weight.sum(1, keepdims=True)
     # Beyond the row all weights are zero; the pixels before those are as good.
     shift = np.maximum(first + weight.shape[1] - size, 0)
-    for row, by in zip(weight, shift, strict=True):
-        row[:] = np.roll(row, by)
+    for row in np.flatnonzero(shift):
+        weight[row] = np.roll(weight[row], shift[row])
     return (first - shift).astype(np.uint32), np.ascontiguousarray(weight.T, np.float32)
 
 
