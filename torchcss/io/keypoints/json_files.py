@@ -244,6 +244,16 @@ def _said_names(content: object, frames: Frames) -> Names | None:
 # Frames.
 
 
+def _not_keypoints(path: Path, content: Any) -> KeypointError:
+    """What a file looks like that holds no list of people."""
+    if isinstance(content, dict) and {"cameras", "K", "camera_matrix"} & content.keys():
+        return KeypointError(f"{path}: a calibration, not keypoints; give it with --camera")
+    return KeypointError(
+        f"{path}: not a keypoint file; expected what a detector writes (docs/guide.md lists the "
+        f"formats), found {shortened(content)}"
+    )
+
+
 def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Person]] | Frames:
     """The people of every frame, by what the file says of it, or in order."""
     if isinstance(content, dict):
@@ -268,7 +278,7 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
                 frames: Frames = {float(k) if are_times else k: p for k, p in found.items()}
                 return in_seconds("t", frames) if are_times else frames
     if not isinstance(content, list):
-        raise _no_keypoints(path, content)
+        raise _not_keypoints(path, content)
     videos = [first_of(entry, VIDEOS) for entry in content if isinstance(entry, dict)]
     check_one_video({video for video in videos if isinstance(video, (str, int))})
     keys = [_key_of(f"{path}: detection {i}", entry) for i, entry in enumerate(content)]
@@ -292,16 +302,6 @@ def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Perso
     if isinstance(first_of(content[0], (time or "",)), str):
         time = "seconds"
     return found if time is None else in_seconds(time, found)
-
-
-def _no_keypoints(path: Path, content: Any) -> KeypointError:
-    """What is wrong with a file that holds no list of frames."""
-    if isinstance(content, dict) and {"cameras", "K", "camera_matrix"} & content.keys():
-        return KeypointError(f"{path}: a calibration, not keypoints; give it with --camera")
-    return KeypointError(
-        f"{path}: not a keypoint file; expected what a detector writes (docs/guide.md lists "
-        f"the formats), found {shortened(content)}"
-    )
 
 
 def _by_joint(content: Mapping[str, Any]) -> list[dict[str, Any]] | None:
