@@ -363,6 +363,16 @@ def test_coco_with_two_skeletons(tmp_path: Path) -> None:
         read(path, image_size_wh=(640, 640))
 
 
+def test_coco_of_twelve_joints(tmp_path: Path) -> None:
+    """36 numbers of 12 names are no 18 pairs."""
+    names = COCO[5:]
+    marks = [{"image_id": t, "keypoints": flat(t, names)} for t in T]
+    content = {"annotations": marks, "categories": [{"keypoints": list(TFJS[5:])}]}
+    found = read(write(tmp_path / "a.json", content))
+    check(found, names=LIMBS[:4])
+    assert found.names == names
+
+
 @pytest.mark.parametrize("more", ["", " 0.91", " 0.91 3"])
 @pytest.mark.parametrize("size", [2, 3])
 def test_yolo_labels(tmp_path: Path, more: str, size: int) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcss.io.keypoints.one_person import colours_of, identified
+from torchcss.io.keypoints.one_person import Whom, colours_of, follow_person, identified
 from torchcss.joint_names import ALIASES
 
 NAMES = [name or "" for name in ALIASES["COCO-17"]]
@@ -55,3 +55,13 @@ def test_colours_are_those_inside() -> None:
     assert found == pytest.approx(np.array([RED, RED]) / 255)
     assert np.isnan(colours_of(picture([]), stands(-300.0)[None], NAMES)).all()
     assert colours_of(picture([]), person[:0].reshape(0, 17, 3), NAMES).shape == (0, 2, 3)
+
+
+def test_who_is_beside_somebody_in_a_later_frame_is_another() -> None:
+    """The first is away when the second comes, near enough to be the first."""
+    frames = [[stands(50.0)], [stands(60.0)], [stands(50.0), stands(60.0)]]
+    tracks: list[list[str | None]] = [["a"], ["b"], ["a", "b"]]
+    report: list[str] = []
+    whom = Whom(0, "prominent", (200, 120))
+    found = follow_person([np.array(each) for each in frames], tracks, whom, report)
+    assert found[:, :, 2].any(1).tolist() == [True, False, True]

@@ -46,12 +46,21 @@ def read_coco(content: Mapping[str, Any]) -> People:
         if "keypoints" in entry and category in (None, entry.get("category_id")):
             about = entry.get("attributes")
             track = track_of({**entry, **(about if isinstance(about, dict) else {})}, _TRACKS)
-            people = one_person(where, entry["keypoints"], entry)
+            joints = _in_threes(entry["keypoints"], names)
+            people = one_person(where, joints, entry)
             found.setdefault(image, []).extend(person._replace(track=track) for person in people)
     if "images" not in content:
         return People(found, names, report)
     frames, size = _by_images(content["images"], found)
     return People(frames, names, report, size_wh=size, whole=True)
+
+
+def _in_threes(joints: Any, names: Names | None) -> Any:
+    """A row of three numbers for each of the names by joints: 36 numbers may be 18 pairs else."""
+    if names is None or not isinstance(joints, list) or len(joints) != 3 * len(names):
+        return joints
+    rows = [joints[place : place + 3] for place in range(0, len(joints), 3)]
+    return joints if isinstance(joints[0], (list, dict)) else rows
 
 
 def _identifier(value: object) -> int | str | None:

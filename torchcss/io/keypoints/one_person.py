@@ -174,7 +174,7 @@ def follow_person(
     chosen[first_frame] = start[place]
     own, lost = tracks[first_frame][place], []
     for order in (range(first_frame + 1, len(frames)), range(first_frame - 1, -1, -1)):
-        last, missed, track, others = chosen[first_frame], 0, own, {*tracks[first_frame]} - {None}
+        last, missed, track, others = chosen[first_frame], 0, own, _beside(own, tracks)
         for index in order:
             choice = _next(last, frames[index], tracks[index], track, others, missed)
             others |= {*tracks[index]} - {None}
@@ -182,7 +182,10 @@ def follow_person(
                 missed += 1
                 lost.append(index)
                 continue
-            last, missed, track = frames[index][choice], 0, tracks[index][choice]
+            if tracks[index][choice] != track:
+                track = tracks[index][choice]
+                others |= _beside(track, tracks)
+            last, missed = frames[index][choice], 0
             chosen[index] = last
     named = "" if own is None else f", {own!r} of the file,"
     which = {"prominent": "most prominent", "centre": "most central"}.get(whom.person, whom.person)
@@ -202,6 +205,11 @@ def follow_person(
     return chosen
 
 
+def _beside(track: str | None, tracks: list[list[str | None]]) -> set[str | None]:
+    """A track, and those that are seen together with it in some frame: they are other people."""
+    return {each for together in tracks if track in together for each in together} - {None}
+
+
 def _next(
     last: np.ndarray,
     people: np.ndarray,
@@ -217,7 +225,7 @@ def _next(
         people: Everybody of the frame.
         tracks: Their tracks.
         track: The person's track; who has it is the person, or of several the nearest.
-        others: Tracks seen so far, which are other people.
+        others: Tracks seen so far or beside the person's, which are other people.
         missed: Frames since the person was seen.
     """
     seen = [index for index, person in enumerate(people) if (person[:, 2] > 0.0).any()]
