@@ -343,15 +343,6 @@ def test_caliscope_leaves_out_what_is_not_calibrated(tmp_path: Path) -> None:
     assert "no extrinsics" in str(load_camera(path).units_note)
 
 
-def test_easymocap_names_stay_text(tmp_path: Path) -> None:
-    names = ["01", "08", "10"]
-    text = "%YAML:1.0\n---\nnames:\n" + "".join(f"  - {name}\n" for name in names)
-    for name in names:
-        text += yaml_matrix(f"K_{name}", K, 3) + f"H_{name}: 480\nW_{name}: 640\n"
-    (tmp_path / "intri.yml").write_text(text)
-    assert list(read_cameras(tmp_path)) == names
-
-
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [

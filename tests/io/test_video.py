@@ -365,34 +365,6 @@ def test_times_that_do_not_rise_are_a_tick_apart(tmp_path: Path) -> None:
     assert times == pytest.approx([0.0, 0.04, 0.04 + 1 / 90_000, 0.04 + 2 / 90_000], abs=1e-6)
 
 
-def test_an_edit_list_hides_frames(tmp_path: Path) -> None:
-    """A telephone trims a film by an edit list: players, and we, begin where it says."""
-    path, hidden = tmp_path / "a.mp4", 4
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30, options={"bf": "0", "g": "1"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for index in range(12):
-            image = np.full((48, 64, 3), grey_level(index), np.uint8)
-            picture = av.VideoFrame.from_ndarray(image, format="rgb24")
-            picture.pts, picture.time_base = index, Fraction(1, 30)
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode(None))
-        assert stream.time_base is not None
-        scale = stream.time_base.denominator
-    data = bytearray(path.read_bytes())
-    place = data.index(b"elst") + 12  # version 0: after version, flags and the number of entries
-    # In the film's thousandths how long, and in the stream's ticks where it begins.
-    data[place : place + 8] = struct.pack(">Ii", 8 * 1000 // 30, hidden * scale // 30)
-    path.write_bytes(bytes(data))
-    reader = VideoReader(path)
-    frames = list(reader)
-    assert reader.count_frames() == reader.num_selected == len(frames) == 12 - hidden
-    assert [frame.index for frame in frames] == list(range(8))
-    assert [frame.time_s for frame in frames] == pytest.approx(reader.frame_times() or [])
-    assert frames[0].time_s == 0.0
-    assert frames[0].image.mean() == pytest.approx(grey_level(hidden), abs=3)
-
-
 # Damage.
 
 

@@ -104,10 +104,6 @@ T = range(FRAMES)
 SEEN = [t for t in T if t != 3]
 
 JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
-    "mmpose inferencer": (
-        [{"frame_id": t, "instances": [mmpose(t, person(t))] if t != 3 else []} for t in T],
-        (3,),
-    ),
     "mmpose demo counts from 1": (
         {
             "meta_info": {"keypoint_id2name": {str(i): n for i, n in enumerate(TFJS)}},
@@ -126,11 +122,6 @@ JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
         ],
         (),
     ),
-    "alphapose open": (
-        {f"{t}.jpg": {"version": 0.1, "people": [{"pose_keypoints_2d": flat(t, OPENPOSE)}]}
-         for t in SEEN},
-        (3,),
-    ),
     "alphapose cmu": (
         {f"{t}.jpg": {"version": "AlphaPose v0.3", "bodies": [{"joints": flat(t, OPENPOSE)}]}
          for t in T},
@@ -140,14 +131,6 @@ JSON_FILES: dict[str, tuple[Any, tuple[int, ...]]] = {
         [{"image_id": f"{t}.jpg", "keypoints": flat(t), "score": 2, "idx": [1.0]} for t in SEEN],
         (3,),
     ),
-    "openpifpaf": (
-        "".join(
-            json.dumps({"frame": t + 1, "predictions": [{"keypoints": flat(t), "id_": 1}]}) + "\r\n"
-            for t in SEEN
-        ),
-        (3,),
-    ),
-    "tfjs one pose a frame": ([points(person(t)) for t in T], ()),
     "tfjs lists of poses": (
         [[points(other(t), id=2), points(person(t), id=1)] if t != 3 else [] for t in T],
         (3,),
@@ -257,10 +240,6 @@ def test_json(tmp_path: Path, kind: str) -> None:
 
 
 FOLDERS: dict[str, Callable[[int], tuple[str, Any]]] = {
-    "openpose of old": lambda t: (
-        f"v_{t:012d}_keypoints.json",
-        {"version": 0.2, "people": [{"pose_keypoints": flat(t, OPENPOSE)}]},
-    ),
     "openpifpaf": lambda t: (f"{t:03d}.jpg.predictions.json", [{"keypoints": flat(t), "bbox": []}]),
     "mmpose": lambda t: (f"{t:03d}.json", [mmpose(t, person(t)), mmpose(t, other(t))]),
     "mmpose demo": lambda t: (
@@ -671,23 +650,6 @@ def test_sleap_csv_of_two_tracks(tmp_path: Path) -> None:
         for track, p in (("track_1", other(t)), ("track_0", person(t))):
             lines.append(",".join([track, str(t), "0.9", *(f"{v}" for v in p.flat)]))
     check(read(write(tmp_path / "a.analysis.csv", "\n".join(lines))), (3,))
-
-
-def test_deeplabcut_with_columns_of_a_smoother(tmp_path: Path) -> None:
-    kinds = ("x_ens_median", "x", "y", "likelihood", "y_posterior_var")
-    head = [
-        [title, *cells]
-        for title, cells in (
-            ("scorer", ["net"] * 85),
-            ("bodyparts", [name for name in TFJS for _ in kinds]),
-            ("coords", list(kinds) * 17),
-        )
-    ]
-    body = [[str(t), *(f"{v}" for row in person(t) for v in (7, *row, 8))] for t in T]
-    text = "\n".join(",".join(row) for row in [*head, *body])
-    found = read(write(tmp_path / "eks.csv", text))
-    check(found)
-    assert any("x_ens_median" in line for line in found.report)
 
 
 # HDF5.
