@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 import torchcss
-from torchcss.app.detect import detect_video, is_detected, masks_of
+from torchcss.app.detect import detect_video, is_detected
 from torchcss.app.view_files import FrameSelection, open_view
 from torchcss.errors import KeypointError, OutputError, TorchcssError
 from torchcss.io.detect import Detected
 from torchcss.io.keypoints.frames import Film
+from torchcss.io.keypoints.masks import masks_of
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
-from torchcss.io.video import VideoWriter
+from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.io.view_files import ViewFiles
 from torchcss.types import Frame, Keypoints
 from torchcss.vision.camera import Camera
@@ -44,13 +45,13 @@ class Crowd:
         ]
         order = slice(None, None, (-1) ** frame.index)
         points = [np.full((17, 3), x) for x, _, _ in self.places[frame.index]]
-        mask = np.zeros(frame.image.shape[:2], dtype=np.uint8)
-        for _, y, _ in self.places[frame.index]:
-            mask[int(y)] = 255
+        masks = np.zeros((len(people), *frame.image.shape[:2]), dtype=np.uint8)
+        for mask, (x, y, _) in zip(masks, self.places[frame.index], strict=True):
+            mask[int(y) - 6 : int(y) + 6, int(x) - 8 : int(x) + 8] = 255
         return Detected(
             np.array(people[order]).reshape(-1, 17, 3),
             np.array(points[order]).reshape(-1, 17, 3),
-            mask,
+            masks[order],
         )
 
     def close(self) -> None:
@@ -89,7 +90,7 @@ def test_everybody_is_found_and_known_again(
     assert any("--person" in line for line in keypoints.report)
 
 
-def test_points_are_those_of_the_person_and_masks_lie_beside(files: Path, crowd: Crowd) -> None:
+def test_points_and_masks_are_those_of_the_person(files: Path, crowd: Crowd) -> None:
     path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
     camera = Camera.pinhole(*SIZE, focal_px=60.0)
     for person, x, frames in (("largest", 48.0, (0, 1, 2)), ("centre", 30.0, (0, 2))):
@@ -100,9 +101,27 @@ def test_points_are_those_of_the_person_and_masks_lie_beside(files: Path, crowd:
         assert view.keypoints is not None
         assert view.keypoints.points is not None
         assert (view.keypoints.points[list(frames)] == x).all()
-        masks = [frame.mask for frame in view.images()]
-        assert len(masks) == 3
-        assert all(mask is not None and mask[24].mean() > 200 > mask[40].mean() for mask in masks)
+        for frame in view.images():
+            assert frame.mask is not None
+            if frame.index not in frames:
+                assert frame.mask.min() == 255  # who is not seen may be anywhere
+                continue
+            at = {u: frame.mask[v, u].mean() for u, v in ((8, 10), (30, 24), (48, 24), (20, 40))}
+            assert at.pop(int(x)) > 200
+            assert max(at.values()) < 50
+
+
+def test_masks_of_one_person_are_as_they_were_found(files: Path, crowd: Crowd) -> None:
+    crowd.places = [[], [(30.0, 24.0, 6.0)], [(30.0, 24.0, 6.0)]]
+    path = detect_video(files / "video.mp4", files / "found.npz", detector=crowd)
+    assert "mask_owner" not in np.load(path)
+    given = ViewFiles(video=files / "video.mp4", keypoints=path, masks=masks_of(path))
+    view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0), FrameSelection(start=1))
+    assert view.own_masks is None
+    assert next(iter(VideoReader(masks_of(path)))).image.min() > 250
+    for frame in view.images():
+        assert frame.mask is not None
+        assert frame.mask[24, 30].mean() > 200 > frame.mask[40].mean()
 
 
 def test_who_is_not_there_is_told(files: Path, crowd: Crowd) -> None:
@@ -214,7 +233,7 @@ def test_frames_that_nobody_asks_for_are_not_detected(files: Path, crowd: Crowd)
     view = open_view(given, Camera.pinhole(*SIZE, focal_px=60.0), FrameSelection(start=1, stop=2))
     (mask,) = [frame.mask for frame in view.images()]
     assert mask is not None
-    assert mask[24].mean() > 200 > mask[40].mean()
+    assert mask[24, 48].mean() > 200 > mask[40].mean()
     assert is_detected(files / "nowhere.npz", 9)
     (files / "broken.npz").write_bytes(b"PK\x03\x04 half of a file")
     assert is_detected(files / "broken.npz", 9)

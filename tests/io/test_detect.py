@@ -50,10 +50,10 @@ def test_rtmlib(
     model = tmp_path / "rtmo.onnx"
     model.write_bytes(b"net")
     detector = open_detector("rtmlib", model)
-    people, points, mask = detector.detect(frame())
+    people, points, masks = detector.detect(frame())
     detector.close()
     assert points is None
-    assert mask is None
+    assert masks is None
     assert people.shape == (2, 17, 3)
     assert people[1, 3].tolist() == [9.0, 9.0, 0.8]
     assert capsys.readouterr().out == ""
@@ -106,12 +106,12 @@ def test_mediapipe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     detector = open_detector("mediapipe", tmp_path / "m.task")
     padded = Frame(0, 0.0, frame(80).image[:, :64])  # rows that do not lie densely
     for _ in range(2):  # frames of one time get times that rise
-        people, points, mask = detector.detect(padded)
+        people, points, masks = detector.detect(padded)
     detector.close()
     assert points is not None
     assert points[0, 0].tolist() == [0.5, 0.25, 0.6]
-    assert mask is not None
-    assert mask[:, 0].tolist() == [51] * 24 + [255] + [51] * 23
+    assert masks is not None
+    assert masks[0, :, 0].tolist() == [51] * 24 + [255] + [51] * 23
     assert people.shape == (1, 33, 3)
     np.testing.assert_allclose(people[0, 0], [31.5, 11.5, 0.36])  # pixel centres at integers
     assert people[0, 1].tolist() == [0, 0, 0]  # a guess
@@ -121,10 +121,10 @@ def test_nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     stub(monkeypatch, "mediapipe", **mediapipe([]))
     monkeypatch.setattr("torchcss.io.detect.find_model", lambda given: given)
     detector = open_detector("mediapipe", tmp_path / "m.task")
-    people, _, mask = detector.detect(frame())
+    people, _, masks = detector.detect(frame())
     assert people.shape == (0, 33, 3)
-    assert mask is not None
-    assert mask.min() == 255  # anybody may be anywhere
+    assert masks is not None
+    assert masks.shape == (0, 48, 64)
 
 
 def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,14 +145,14 @@ def test_a_real_person() -> None:
     pytest.importorskip("mediapipe")
     detector = open_detector("mediapipe", SHARED / "detector" / "pose_landmarker_full.task")
     seen = next(iter(VideoReader(SHARED / "balance_beam_4cam" / "cam01.mp4")))
-    people, points, mask = detector.detect(seen)
+    people, points, masks = detector.detect(seen)
     detector.close()
     assert len(people) == 1
     assert points is not None
-    assert mask is not None
+    assert masks is not None
     known = np.load(SHARED / "balance_beam_4cam" / "keypoints2d_cam01.npz")
     wrist = known["keypoints"][0, list(known["joint_names"]).index("LWrist")]
     assert np.linalg.norm(people[0, 15, :2] - wrist) < 40
     assert 1.0 < points[0, :, 1].max() - points[0, :, 1].min() < 2.0  # metres, down
     hip = people[0, 23].round().astype(int)
-    assert mask[hip[1], hip[0]] > 200 > 50 > mask[5, 5]
+    assert masks[0, hip[1], hip[0]] > 200 > 50 > masks[0, 5, 5]

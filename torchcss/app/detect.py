@@ -3,7 +3,7 @@
 `detect_video` is what `torchcss detect` calls, and `torchcss track` where no keypoints are given.
 It writes `keypoints [T P J 2]`, `confidence [T P J]`, `joint_names [J]`, `person_ids [P]`,
 `image_size_wh`, `relative_noise` and `frames_seen`, which `torchcss.io.keypoints` reads; of a
-detector that says them `points [T P J 3]`, and beside the file the masks, a film (`masks_of`).
+detector that says them `points [T P J 3]`, and the masks (`torchcss.io.keypoints.masks`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from tqdm import tqdm
 from torchcss.errors import KeypointError, OutputError
 from torchcss.files import load_arrays, prepare_output_folder, save_arrays
 from torchcss.io.detect import Detected, Detector, DetectorName, open_detector
+from torchcss.io.keypoints.masks import MASK_CELLS, masks_of, owner_of_cells
 from torchcss.io.keypoints.one_person import colours_of, identified
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.joint_names import ALIASES
@@ -76,7 +77,7 @@ def detect_video(
         tqdm.write("loading the detector ...", file=sys.stderr)
         detector = open_detector(options.detector, options.detector_model)
     try:
-        frames, colours = _detected(reader, detector, masks_of(out), start)
+        frames, colours, owners = _detected(reader, detector, masks_of(out), start)
     finally:
         detector.close()
     if not any(len(found.joints) for found in frames):
@@ -93,8 +94,9 @@ def detect_video(
         more = (reader.info.num_frames or 0) - stop
         frames += [_nobody(frames[-1])] * more
         colours += [colours[-1][:0]] * more
+        owners += [None] * more
     ids = identified([found.joints for found in frames], colours)
-    write_people(out, frames, ids, detector, size, (start, end))
+    write_people(out, frames, ids, detector, size, (start, end), owners)
     return out
 
 
@@ -118,35 +120,34 @@ def is_detected(keypoints: Path, stop: int | None) -> bool:
     return end == _TO_THE_END or (stop is not None and stop <= end)
 
 
-def masks_of(keypoints: Path) -> Path:
-    """Where the masks lie that were found with these keypoints: white where anybody is."""
-    return keypoints.with_name(f"{keypoints.stem}_masks.mp4")
-
-
 def _detected(
     reader: VideoReader, detector: Detector, masks: Path, start: int
-) -> tuple[list[Detected], list[np.ndarray]]:
-    """The people of every frame and their colours, nobody in those before the start.
+) -> tuple[list[Detected], list[np.ndarray], list[np.ndarray | None]]:
+    """The people of every frame, their colours, and whose masks are where if they are several.
 
-    Their masks go into a film.
+    Nobody is in frames before the start. Their masks go into a film.
     """
     found: list[Detected] = []
     colours: list[np.ndarray] = []
+    owners: list[np.ndarray | None] = []
     names = [name or "" for name in ALIASES[detector.layout]]
     with VideoWriter(masks, reader.info.frame_rate) as film:
         for frame in tqdm(reader, "detecting", reader.num_selected, unit="frame"):
             seen = detector.detect(frame)
             before = 0 if found else start
-            if seen.mask is not None:
-                mask = np.repeat(seen.mask[..., None], 3, axis=-1)
+            owners += [None] * (before + 1)
+            if seen.masks is not None:
+                anywhere = np.full_like(frame.image, 255)
                 for _ in range(before):
-                    film.write(np.full_like(mask, 255))
-                film.write(mask)
-            found += [*[_nobody(seen)] * before, seen._replace(mask=None)]
+                    film.write(anywhere)
+                several = seen.masks.max(0, initial=0)[..., None].repeat(3, -1)
+                film.write(several if len(seen.masks) else anywhere)
+                owners[-1] = owner_of_cells(seen.masks)
+            found += [*[_nobody(seen)] * before, seen._replace(masks=None)]
             colours += [
                 colours_of(frame.image, each.joints, names) for each in found[len(colours) :]
             ]
-    return found, colours
+    return found, colours, owners
 
 
 def _nobody(like: Detected) -> Detected:
@@ -162,6 +163,7 @@ def write_people(
     detector: Detector,
     image_size_wh: tuple[int, int],
     seen: tuple[int, int],
+    owners: Sequence[np.ndarray | None],
 ) -> None:
     """Write who is where in every frame, every person under one number; joints that bodies have.
 
@@ -172,6 +174,7 @@ def write_people(
         detector: What found them.
         image_size_wh: Size of the images.
         seen: First frame given to the detector, and the one after the last or `_TO_THE_END`.
+        owners: Of every frame whose masks are where, `owner_of_cells`.
     """
     count = 1 + max((number for people in ids for number in people), default=0)
     names = {name: column for column, name in enumerate(ALIASES[detector.layout]) if name}
@@ -193,4 +196,10 @@ def write_people(
     }
     if np.isfinite(points).any():
         arrays["points"] = points
-    save_arrays(out, arrays)
+    if any(owner is not None for owner in owners):
+        whose = np.full((len(frames), *MASK_CELLS), -1, np.int16)
+        for row, owner, numbers in zip(whose, owners, ids, strict=True):
+            if owner is not None:
+                row[:] = np.array(numbers)[owner]
+        arrays["mask_owner"] = whose
+    save_arrays(out, arrays, compressed="mask_owner" in arrays)

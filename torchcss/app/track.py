@@ -21,7 +21,7 @@ import torch
 from tqdm import tqdm
 
 from torchcss.app.claims import WorkClaim
-from torchcss.app.detect import DetectOptions, detect_video, is_detected, masks_of
+from torchcss.app.detect import DetectOptions, detect_video, is_detected
 from torchcss.app.init import initialise_video
 from torchcss.app.lens import PERSONS, KnownLens, fitted
 from torchcss.app.lock import locked
@@ -46,6 +46,7 @@ from torchcss.initialise.result import Initialisation, check_stature, stature_of
 from torchcss.io.cameras import LoadedCamera, load_camera
 from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body, write_fitted_body
 from torchcss.io.keypoints.links import Links
+from torchcss.io.keypoints.masks import masks_of
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.run import Run, as_run
 from torchcss.io.tracks import TRACK_NAME

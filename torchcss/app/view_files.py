@@ -22,6 +22,7 @@ from torchcss.io.cameras import LoadedCamera, camera_findings, check_image_size,
 from torchcss.io.keypoints.arrays import read_points
 from torchcss.io.keypoints.frames import Film
 from torchcss.io.keypoints.links import Links
+from torchcss.io.keypoints.masks import OwnMasks, masks_of, read_own_masks
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
 from torchcss.io.run import Run
@@ -41,6 +42,7 @@ class OpenView(NamedTuple):
         camera: The camera, and what its file said about it.
         keypoints: Of the whole video.
         sigma: Noise of a keypoint, pixels of the full image.
+        own_masks: What of the masks is the person's, where several people were detected.
     """
 
     files: ViewFiles
@@ -49,6 +51,7 @@ class OpenView(NamedTuple):
     camera: LoadedCamera
     keypoints: Keypoints | None
     sigma: float
+    own_masks: OwnMasks | None = None
 
     def with_noise(self, factor: float) -> OpenView:
         """The same with so many times the noise, which is known from now on."""
@@ -123,7 +126,9 @@ class OpenView(NamedTuple):
                 )
             else:
                 height, width = frame.image.shape[:2]
-                yield replace(frame, mask=mask.image[:height, :width])
+                image = mask.image[:height, :width]
+                own = image if self.own_masks is None else self.own_masks.alone(frame.index, image)
+                yield replace(frame, mask=own)
 
 
 def moments(
@@ -217,7 +222,10 @@ def open_view(
     keypoints = _keypoints(files, reader, start, links)
     sigma = files.sigma or keypoints.relative_noise * typical_sigma(keypoints)
     keypoints = read_points(files.keypoints, keypoints._replace(relative_noise=1.0))
-    return OpenView(files, reader, masks, loaded, keypoints, sigma)
+    own = None
+    if files.masks is not None and files.masks.resolve() == masks_of(files.keypoints).resolve():
+        own = read_own_masks(files.keypoints, keypoints)
+    return OpenView(files, reader, masks, loaded, keypoints, sigma, own)
 
 
 def open_run(run: Run, selection: FrameSelection) -> list[OpenView]:

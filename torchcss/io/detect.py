@@ -46,13 +46,12 @@ class Detected(NamedTuple):
         joints: Of everybody: u, v in pixels, centres at integers, and the weight.
         points: Where the detector believes them in space, metres from the middle of the hips, in
             the camera's axes; None: it does not say.
-        mask: How much each pixel belongs to anybody, 0 to 255, all of it where nobody is found;
-            None: it does not say.
+        masks: How much each pixel belongs to each of them, 0 to 255; None: it does not say.
     """
 
     joints: Float[np.ndarray, "p j 3"]
     points: Float[np.ndarray, "p j 3"] | None = None
-    mask: UInt8[np.ndarray, "h w"] | None = None
+    masks: UInt8[np.ndarray, "p h w"] | None = None
 
 
 class Detector(Protocol):
@@ -134,14 +133,12 @@ class MediaPipe:
         sure = joints[..., 2:] > _LEAST_VISIBILITY
         joints[..., 2] **= 2
         points = [[(m.x, m.y, m.z) for m in person] for person in found.pose_world_landmarks]
-        # Where nobody is found, it says None, and anybody may be anywhere.
-        given = found.segmentation_masks or ()
-        masks = [mask.numpy_view().reshape(pixels.shape[:2]) for mask in given]
-        mask = np.max(masks, axis=0) if masks else np.ones(pixels.shape[:2])
+        # Where nobody is found, it says None.
+        masks = [mask.numpy_view() for mask in found.segmentation_masks or ()]
         return Detected(
             np.where(sure, joints, 0.0),
             np.array(points, dtype=np.float64).reshape(-1, 33, 3),
-            (255.0 * mask).round().astype(np.uint8),
+            (255.0 * np.array(masks)).round().astype(np.uint8).reshape(-1, *pixels.shape[:2]),
         )
 
     def close(self) -> None:

@@ -2,11 +2,11 @@
 
 Ours is `keypoints [T J 2]`, `confidence [T J]`, `joint_names [J]`; of several people `[T P J 2]`,
 `[T P J]` and `person_ids [P]`; and `image_size_wh [2]` and `relative_noise []` (`People`), and
-`points [T P J 3]` (`read_points`). Read as well, as NPY or as the only array of an NPZ: pairs or
-triples `[T J 2]`, `[T J 3]` (x, y, confidence), in another order of axes where their sizes tell it
-(ST-GCN's `[3 T J 1]`), of several people `[T P J 3]`, of one picture `[J 3]`, and MoveNet's
-`[T 1 1 17 3]` or, in fractions, `[T 1 17 3]` (y, x, confidence). Confidences may be called `scores`
-and the like.
+`points [T P J 3]` (`read_points`), and whose masks are where (`torchcss.io.keypoints.masks`). Read
+as well, as NPY or as the only array of an NPZ: pairs or triples `[T J 2]`, `[T J 3]` (x, y,
+confidence), in another order of axes where their sizes tell it (ST-GCN's `[3 T J 1]`), of several
+people `[T P J 3]`, of one picture `[J 3]`, and MoveNet's `[T 1 1 17 3]` or, in fractions,
+`[T 1 17 3]` (y, x, confidence). Confidences may be called `scores` and the like.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchcss.errors import KeypointError
 from torchcss.files import load_arrays, shortened, unexpected
@@ -140,12 +142,17 @@ def read_points(path: Path, keypoints: Keypoints) -> Keypoints:
     pixels, points = arrays.get("keypoints", nothing), arrays.get("points", nothing)
     if points.shape != (*pixels.shape[:3], 3) or not {*keypoints.names} <= {*names}:
         return keypoints  # somebody else's points
-    places = torch.as_tensor(pixels).to(keypoints.positions)
     column = [names.index(name) for name in keypoints.names]
-    gap = (places[:, :, column] - keypoints.positions[:, None]).norm(dim=-1)
-    gap = torch.where(keypoints.confidence[:, None] > 0, gap, 0.0).nan_to_num(torch.inf).sum(-1)
-    points = torch.as_tensor(points).to(places)[:, :, column]
-    return keypoints._replace(points=points[torch.arange(len(gap)), gap.argmin(1)])
+    person = person_places(pixels[:, :, column], keypoints)
+    points = torch.as_tensor(points).to(keypoints.positions)[:, :, column]
+    return keypoints._replace(points=points[torch.arange(len(person)), person])
+
+
+def person_places(pixels: np.ndarray, keypoints: Keypoints) -> Int[Tensor, " t"]:
+    """The place of the person among everybody in every frame, by the pixels `[t p j 2]` of all."""
+    gap = torch.as_tensor(pixels).to(keypoints.positions) - keypoints.positions[:, None]
+    known = keypoints.confidence[:, None] > 0
+    return torch.where(known, gap.norm(dim=-1), 0.0).nan_to_num(torch.inf).sum(-1).argmin(1)
 
 
 def _numbered(array: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
