@@ -74,13 +74,13 @@ class Preset:
         samples_body: Samples per frame for a body.
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
-        likelihood_power: See `Tracker`. Below 1, of two poses that look alike the one that was
-            right so far stays the best (`scripts/evaluate_posterior.py` measures it).
+        power_of_part: `Tracker.likelihood_power` for each part of the body, since costs are means
+            over all nodes: what one part shows weighs less, the more parts there are. Of two poses
+            that look alike, the one that was right so far stays the best
+            (`scripts/evaluate_posterior.py` measures it). None: a power of 1, as in the papers.
         survivors_arm: `Tracker.survivors` for an arm.
         survivors_body: The same for a body.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.
-        power_arm: `likelihood_power` for an arm, if other than for a body. Its modes cost the same
-            for longer, since it has no `segmentation`: the rest of its person looks the same.
         persistence: Share of its last motion that a mode goes on with: 0 is driftless diffusion, 1
             constant velocity. The papers' own trackers have 0, Cham and Rehg's 1. With some, a mode
             does not lag behind a limb whose flow is underestimated.
@@ -94,9 +94,7 @@ class Preset:
             explanations, see `Tracker`. The papers have none; their modes are distinct minima. By
             the mean distance of all joints an arm that is flipped would hardly count.
         soft_matching: See `Tracker`.
-        surprise_body: `Tracker.surprise` for a body: 0.15 of its n = 34 nats, as of a frame's
-            likelihood. An arm keeps n: nothing tells it from its mirror image but
-            where it was.
+        surprise: See `Tracker`; 0.15 of the n = 34 nats of a person, as of a frame's likelihood.
         jumps_every: Every how many frames the flips of the best mode join the search, see
             `torchcss.tracking.flip_moves`; 0, as in the papers: never, nor do limbs that are put
             at keypoints that they miss (`torchcss.tracking.keypoint_moves`).
@@ -121,11 +119,10 @@ class Preset:
     samples_body: int
     modes_arm: int = 3
     modes_body: int = 7
-    likelihood_power: float = 1.0
+    power_of_part: float | None = None
     survivors_arm: int = 0
     survivors_body: int = 0
     proposal_arm: Proposal | None = None
-    power_arm: float | None = None
     persistence: float = 0.0
     noise: float = 1.0
     robust: bool = True
@@ -134,7 +131,7 @@ class Preset:
     curvature: Curvature = Curvature.EXACT
     separation: float = 0.0
     soft_matching: bool = False
-    surprise_body: float = math.inf
+    surprise: float = math.inf
     jumps_every: int = 0
     keep_alike: bool = True
     coarse_every: int = 3
@@ -186,14 +183,13 @@ _CSS = Preset(
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=160,
     samples_body=60,
-    likelihood_power=0.15,
-    power_arm=0.05,
+    power_of_part=0.15 / 18,  # of the parts of a person
     survivors_arm=20,
     survivors_body=15,
     persistence=0.8,
     separation=0.12,
     soft_matching=True,
-    surprise_body=5.1,
+    surprise=5.1,
     jumps_every=3,
 )
 

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 
 import torch
 
-from torchcss.body.load import has_free_root
+from torchcss.body.load import has_free_root, load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.cost.choice import TERM_TABLE, CostChoice
@@ -469,17 +469,17 @@ def _printed(
 
 
 def make_tracker(
-    settings: Settings, motion: Deviation = 0.0, free_root: bool | None = None
+    settings: Settings, motion: Deviation = 0.0, body: BodyModel | None = None
 ) -> SequenceTracker:
     """The tracker that the settings ask for: the row of the table with their numbers.
 
     Args:
         settings: Preset and numbers; arms and bodies differ in the preset's.
         motion: Standard deviation of every parameter's motion per frame.
-        free_root: Whether the body moves about; None: told by its name.
+        body: The body; None: the one that the settings name.
     """
-    row = PRESETS[settings.preset]
-    arm = not (has_free_root(settings.body) if free_root is None else free_root)
+    row, body = PRESETS[settings.preset], body or load_body(settings.body)
+    arm = not has_root(body)
     num_samples = settings.samples or (row.samples_arm if arm else row.samples_body)
     num_modes = settings.modes or (row.modes_arm if arm else row.modes_body)
     many = isinstance(motion, tuple)
@@ -498,7 +498,7 @@ def make_tracker(
             num_modes=num_modes,
             optimiser=row.optimiser,
         )
-    power = row.power_arm if arm and row.power_arm is not None else row.likelihood_power
+    power = 1.0 if row.power_of_part is None else min(1.0, row.power_of_part * body.num_parts)
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
         proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
@@ -517,7 +517,7 @@ def make_tracker(
         dynamics=dynamics,
         separation=row.separation,
         soft_matching=row.soft_matching,
-        surprise=math.inf if arm else row.surprise_body,
+        surprise=row.surprise,
     )
 
 
@@ -602,7 +602,7 @@ def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_inter
     return Plan(
         extractor=extractor,
         choice=make_choice(settings, noise, has_root(body)),
-        tracker=make_tracker(settings, tuple(motion.tolist()), has_root(body)),
+        tracker=make_tracker(settings, tuple(motion.tolist()), body),
         bounds=row.bounds(body.bounds),
         one_fit=row.start == "one fit",
         keypoints_first_only=settings.keypoints_first_only,
