@@ -75,7 +75,8 @@ class Preset:
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
         power_of_part: `Tracker.likelihood_power` for each part of the body, since costs are means
-            over all nodes: what one part shows weighs less, the more parts there are. Of two poses
+            over all nodes: what one part shows weighs less, the more parts there are. One without
+            parts has keypoints alone, which are a sum, and counts as a person does. Of two poses
             that look alike, the one that was right so far stays the best
             (`scripts/evaluate_posterior.py` measures it). None: a power of 1, as in the papers.
         survivors_arm: `Tracker.survivors` for an arm.
@@ -167,6 +168,9 @@ class Preset:
         return unbounded(limits.lower)
 
 
+PARTS_OF_A_PERSON = 18
+"""Of the bodies that ship."""
+
 _OURS = TrustRegionNewton(max_steps=60, tolerance=1e-2, initial_radius=1 / 16)
 """Of our rows. The radius is in metres and radians: the edges are searched for some 20 pixels to
 either side, and most first steps of a quarter of a radian and more are rejected."""
@@ -183,7 +187,7 @@ _CSS = Preset(
     proposal=CovarianceScaled(covariance_scale=8.0, max_deviation=1.0),
     samples_arm=160,
     samples_body=60,
-    power_of_part=0.15 / 18,  # of the parts of a person
+    power_of_part=0.15 / PARTS_OF_A_PERSON,
     survivors_arm=20,
     survivors_body=15,
     persistence=0.8,

@@ -34,7 +34,7 @@ from torchcss.inference.proposals import ChamRehg, Condensation, EigenDirectionG
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.initialise.view import CameraView
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
-from torchcss.tracking.presets import PRESETS, Preset, preset_name
+from torchcss.tracking.presets import PARTS_OF_A_PERSON, PRESETS, Preset, preset_name
 from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import Observer
 from torchcss.types import Bounds, Curvature, frozen
@@ -498,7 +498,8 @@ def make_tracker(
             num_modes=num_modes,
             optimiser=row.optimiser,
         )
-    power = 1.0 if row.power_of_part is None else min(1.0, row.power_of_part * body.num_parts)
+    parts = body.num_parts or PARTS_OF_A_PERSON
+    power = 1.0 if row.power_of_part is None else min(1.0, row.power_of_part * parts)
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
         proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
