@@ -970,6 +970,32 @@ def is_placed(path: Path, name: str | None = None) -> None:
     np.testing.assert_allclose(found.camera.t_camera_world, PLACED["t"], atol=1e-9)
 
 
+@pytest.mark.parametrize("form", ["json", "vectors", "yml", "npz", "toml"])
+def test_one_camera_with_its_place(tmp_path: Path, form: str) -> None:
+    """Without a unit that is told, and used with one; places of the board are none."""
+    suffix = form.replace("vectors", "json")
+    path, turn = tmp_path / f"a.{suffix}", [0.0, -0.5, 0.0] if form == "vectors" else PLACED["R"]
+
+    def save(**more: Any) -> None:
+        values = {"K": K, "R": turn, "T": PLACED["t"], "image_size": [640, 480], **more}
+        if suffix == "npz":
+            np.savez(path, **{key: np.array(each) for key, each in values.items()})
+        elif suffix == "json":
+            path.write_text(json.dumps(values))
+        else:
+            lines = [f"{key}{'=' if form == 'toml' else ': '}{json.dumps(each)}\n"
+                     for key, each in values.items()]  # fmt: skip
+            path.write_text(("" if form == "toml" else "%YAML:1.0\n---\n") + "".join(lines))
+
+    save()
+    note = str(load_camera(path).units_note)
+    assert 'has extrinsics of unknown unit (the file may say units: "mm"' in note
+    save(units="m")
+    is_placed(path)
+    save(R=[turn] * 2, T=[PLACED["t"]] * 2, units="m")
+    assert "no extrinsics" in str(load_camera(path).units_note)
+
+
 @pytest.mark.parametrize("factor", [1.0, -0.37])
 def test_projection_matrices_are_taken_apart(tmp_path: Path, factor: float) -> None:
     one = {"P": (factor * PROJECTION).tolist(), "image_size_wh": [640, 480]}

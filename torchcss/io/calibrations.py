@@ -539,17 +539,24 @@ def _numbered(values: object) -> dict[str, dict[str, Any]]:
     return {}
 
 
+def _is_one_place(entry: Entry) -> bool:
+    """Whether these are one rotation, as a matrix or a vector, and one translation."""
+    rotation, translation = (np.prod(_shape(each)) for each in entry[3:5])
+    return rotation in (3, 9) and translation == 3
+
+
 def _alone(path: Path, values: Mapping[str, Any]) -> dict[str, Entry]:
-    """The one camera of a file without extrinsics: those of the board's pictures are none."""
+    """The one camera of a file, or a numbered pair; the board's places are not the camera's."""
     cameras: Mapping[str, Mapping[str, Any]] = _numbered(values)
     if not cameras and not _has_camera(values):
         raise unexpected(CameraError, path, "a calibration with camera_matrix", list(values))
     alone = str(values.get("camera_name", values.get("name", path.stem)))
     entries: dict[str, Entry] = {}
     for name, own in (cameras or {alone: values}).items():
-        entry = _entry(own, values.get("units"))
-        place = entry[3:5] if _projection(own) is not None else (None, None)
-        entries[name] = entry._replace(rotation=place[0], translation=place[1])
+        entry = _entry(own, first_of(values, ("units", "unit")))
+        # A pair's R and T lead from one to the other; several are those of the board.
+        is_place = _projection(own) is not None or (not cameras and _is_one_place(entry))
+        entries[name] = entry if is_place else entry._replace(rotation=None, translation=None)
     return entries
 
 
