@@ -15,8 +15,6 @@ from torchcss.io.detect import open_detector
 from torchcss.io.video import VideoReader
 from torchcss.types import Frame
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
-
 
 def frame(width: int = 64, height: int = 48) -> Frame:
     image = np.zeros((height, width, 3), dtype=np.uint8)
@@ -140,17 +138,16 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         open_detector("mediapipe", None)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the clips are not here")
-def test_a_real_person() -> None:
+def test_a_real_person(shared_data: Path) -> None:
     pytest.importorskip("mediapipe")
-    detector = open_detector("mediapipe", SHARED / "detector" / "pose_landmarker_full.task")
-    seen = next(iter(VideoReader(SHARED / "balance_beam_4cam" / "cam01.mp4")))
+    detector = open_detector("mediapipe", shared_data / "detector" / "pose_landmarker_full.task")
+    seen = next(iter(VideoReader(shared_data / "balance_beam_4cam" / "cam01.mp4")))
     people, points, masks = detector.detect(seen)
     detector.close()
     assert len(people) == 1
     assert points is not None
     assert masks is not None
-    known = np.load(SHARED / "balance_beam_4cam" / "keypoints2d_cam01.npz")
+    known = np.load(shared_data / "balance_beam_4cam" / "keypoints2d_cam01.npz")
     wrist = known["keypoints"][0, list(known["joint_names"]).index("LWrist")]
     assert np.linalg.norm(people[0, 15, :2] - wrist) < 40
     assert 1.0 < points[0, :, 1].max() - points[0, :, 1].min() < 2.0  # metres, down
