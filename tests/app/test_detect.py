@@ -170,10 +170,14 @@ def test_a_video_alone_is_tracked(
     assert "as given" in notes
 
 
+@pytest.mark.parametrize("at_first", [[], [(-99.0, 24.0, 9.0)]], ids=["nobody", "out of sight"])
 def test_a_video_is_tracked_from_where_somebody_is_seen(
-    files: Path, crowd: Crowd, monkeypatch: pytest.MonkeyPatch
+    files: Path,
+    crowd: Crowd,
+    monkeypatch: pytest.MonkeyPatch,
+    at_first: list[tuple[float, float, float]],
 ) -> None:
-    crowd.places[0] = []
+    crowd.places[0] = at_first
     monkeypatch.setattr("torchcss.app.detect.open_detector", lambda *_: crowd)
     settings = torchcss.Settings(body="arm7", samples=3, modes=2, overlay=False)
     options = torchcss.TrackOptions(person="leftmost", fov=60.0)

@@ -297,7 +297,7 @@ def _from_somebody(keypoints: Path, selection: FrameSelection, person: str) -> F
         person: Who is asked for.
     """
     arrays = load_arrays(keypoints, KeypointError)
-    belief = arrays["confidence"].sum(-1)[selection.start : selection.stop]
+    belief = _seen(arrays)[selection.start : selection.stop]
     if belief[0].any():
         return selection
     numbers = arrays["person_ids"].astype(str).tolist()
@@ -316,8 +316,15 @@ def _moved_again(begun: Run, selection: FrameSelection) -> FrameSelection:
     keypoints = _detected_by(begun)
     if keypoints is None or known <= selection.start:
         return selection
-    nobody = not load_arrays(keypoints, KeypointError)["confidence"][selection.start].any()
+    nobody = not _seen(load_arrays(keypoints, KeypointError))[selection.start].any()
     return replace(selection, start=known) if nobody else selection
+
+
+def _seen(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """How much is seen of everybody in every frame: the confidences of joints in the picture."""
+    places = arrays["keypoints"]
+    inside = ((places > -0.5) & (places < arrays["image_size_wh"] - 0.5)).all(-1)
+    return np.where(inside, arrays["confidence"], 0.0).sum(-1)
 
 
 def _detected_by(run: Run) -> Path | None:

@@ -60,7 +60,10 @@ def _outside(joints: np.ndarray, image_size_wh: Size, first_frame: int) -> list[
         f"some in {len(frames)} of {len(joints)} frames"
     )
     if outside.sum() > 0.2 * confident.sum():
-        line += "; were the keypoints made from this video, at this size?"
+        line += (
+            "; were the keypoints made from this video, at this size? A detector guesses what is "
+            "not in the picture: an arm alone needs its own joints, and --body arm8"
+        )
     return [line]
 
 
