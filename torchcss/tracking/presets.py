@@ -75,10 +75,11 @@ class Preset:
         modes_arm: Modes kept for an arm.
         modes_body: Modes kept for a body.
         power_of_part: `Tracker.likelihood_power` for each part of the body, since costs are means
-            over all nodes: what one part shows weighs less, the more parts there are. One without
-            parts has keypoints alone, which are a sum, and counts as a person does. Of two poses
-            that look alike, the one that was right so far stays the best
-            (`scripts/evaluate_posterior.py` measures it). None: a power of 1, as in the papers.
+            over all nodes: what one part shows weighs less, the more parts there are. A body of
+            more parts than a person counts as a person does, for want of measurements, and so does
+            one without parts: it has keypoints alone, which are a sum. Of two poses that look
+            alike, the one that was right so far stays the best (`scripts/evaluate_posterior.py`
+            measures it). None: a power of 1, as in the papers.
         survivors_arm: `Tracker.survivors` for an arm.
         survivors_body: The same for a body.
         proposal_arm: Where samples go for an arm, if elsewhere than for a body.

@@ -498,8 +498,8 @@ def make_tracker(
             num_modes=num_modes,
             optimiser=row.optimiser,
         )
-    parts = body.num_parts or PARTS_OF_A_PERSON
-    power = 1.0 if row.power_of_part is None else min(1.0, row.power_of_part * parts)
+    parts = min(body.num_parts or PARTS_OF_A_PERSON, PARTS_OF_A_PERSON)
+    power = 1.0 if row.power_of_part is None else row.power_of_part * parts
     # Who searches by noise adds it in the proposal; the dynamics themselves then add none.
     if isinstance(proposal, (ChamRehg, Condensation)):
         proposal, dynamics = replace(proposal, deviation=noise), replace(dynamics, deviation=0.0)
