@@ -37,8 +37,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def init(scene: Path, out: Path, *more: str) -> int:
     given = ["init", str(scene / "picture.png"), "--out", str(out), "--body", "arm8", *more]
-    if "--click" not in more and "--joints" not in more:
-        given += ["--joints", str(scene / "joints.json")]
+    if not {"--click", "--keypoints", "--joints"} & set(more):
+        given += ["--keypoints", str(scene / "joints.json")]
     return cli.main(given)
 
 
@@ -101,7 +101,8 @@ def test_track_starts_from_it(scene: Path, result: Path, tmp_path: Path, capsys)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--joints", "nowhere.json"), "nowhere.json"),
+        (("--keypoints", "nowhere.json"), "nowhere.json"),
+        (("--joints", "nowhere.json"), "nowhere.json"),  # its name in version 0.1
         (("--camera", "nowhere.json"), "nowhere.json"),
         (("--focal-px", "500", "--field-of-view", "60"), "--focal or --fov"),
         (("--field-of-view", "200"), "--fov: expected degrees"),
@@ -201,9 +202,10 @@ def test_from_a_frame_of_a_video(scene: Path, tmp_path: Path, monkeypatch: pytes
     assert list(json.loads(made.read_text())["frames"]) == ["1"]
     for number, joints in enumerate((made, scene / "keypoints.npz", scene / "joints.json")):
         out = tmp_path / str(number)
-        assert cli.main([*video, "--joints", str(joints), "--out", str(out)]) == 0
+        assert cli.main([*video, "--keypoints", str(joints), "--out", str(out)]) == 0
         assert json.loads((out / "summary.json").read_text())["frame"] == 1
-    assert cli.main([*video[:3], "7", *quick, "--joints", str(made), "--out", str(tmp_path)]) == 2
+    given = ["--keypoints", str(made), "--out", str(tmp_path)]
+    assert cli.main([*video[:3], "7", *quick, *given]) == 2
     given = [
         "track", str(scene / "video.mp4"), "--camera", str(scene / "cameras.json"), "--start", "1",
         "--keypoints", str(made), "--init", str(tmp_path / "a"), "--keypoints-use", "first",

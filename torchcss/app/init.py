@@ -53,12 +53,12 @@ NUM_DRAWN = 7
 
 @frozen
 class PictureFiles:
-    """What belongs to a picture: its joints and its camera.
+    """What belongs to a picture: its keypoints and its camera.
 
     Attributes:
         frame: Which frame of the video, from 0; `torchcss track --start` takes the same number.
-        joints: Marked joints: clicked JSON, CSV, OpenPose, COCO, MediaPipe or NPZ.
-        layout: Layout of a joints file that does not name its joints, e.g. BODY_25.
+        keypoints: Marked joints: clicked JSON, CSV, OpenPose, COCO, MediaPipe or NPZ.
+        layout: Layout of a keypoints file that does not name its joints, e.g. BODY_25.
         normalised: Whether joints are pixels, or fractions of the picture from 0 to 1 or from -1
             to 1.
         camera: Calibration; without it a pinhole camera of --focal, --fov or 54 degrees.
@@ -68,7 +68,7 @@ class PictureFiles:
     """
 
     frame: int = 0
-    joints: Path | None = None
+    keypoints: Path | None = None
     layout: str | None = None
     normalised: Scale = "pixels"
     camera: Path | None = None
@@ -97,10 +97,10 @@ class PictureFiles:
         Raises:
             KeypointError: If they cannot be read.
         """
-        if self.joints is None:
-            raise KeypointError("give a file with --joints, or --click to mark the joints")
+        if self.keypoints is None:
+            raise KeypointError("give a file with --keypoints, or --click to mark the joints")
         return read_joints(
-            self.joints,
+            self.keypoints,
             image_size_wh=(width, height),
             layout=self.layout,
             normalised=self.normalised,

@@ -70,8 +70,8 @@ class Init:
         files, keypoints = self.files, None
         if self.initialisation == "papers":
             self._check_papers()
-        if self.click == (files.joints is not None):
-            raise KeypointError("give a file with --joints, or --click to mark the joints")
+        if self.click == (files.keypoints is not None):
+            raise KeypointError("give a file with --keypoints, or --click to mark the joints")
         if self.click:
             # Matplotlib takes half a second to import.
             from torchcss.show.click import click_joints, write_clicked

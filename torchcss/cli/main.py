@@ -87,6 +87,7 @@ _LEFT = {
 """What an interruption leaves of the verbs that track."""
 
 _OLD_NAMES = {
+    "--joints": "--keypoints",
     "--evidence": "--likelihood-power",
     "--focal-px": "--focal",
     "--field-of-view": "--fov",
