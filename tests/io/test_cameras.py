@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchcss.errors import CameraError
-from torchcss.io.calibrations import read_entries
+from torchcss.io.calibrations.read import read_entries
 from torchcss.io.cameras import (
     camera_findings,
     check_image_size,

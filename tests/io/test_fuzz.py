@@ -30,7 +30,7 @@ from torchcss.body.load import load_body
 from torchcss.errors import TorchcssError, TrackFileError
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
-from torchcss.io.calibrations import read_entries
+from torchcss.io.calibrations.read import read_entries
 from torchcss.io.cameras import load_lens, read_camera, read_cameras
 from torchcss.io.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from torchcss.io.fitted_body import read_fitted_body, write_fitted_body

@@ -28,7 +28,8 @@ import torch
 from torchcss.body.rotations import from_axis_angle
 from torchcss.errors import CameraError
 from torchcss.files import StrPath, real_numbers, shortened, unexpected
-from torchcss.io.calibrations import Entry, read_entries
+from torchcss.io.calibrations.entry import Entry
+from torchcss.io.calibrations.read import read_entries
 from torchcss.io.lenses import MOST_COEFFICIENTS, Lens, Mirror
 from torchcss.io.video import VideoReader
 from torchcss.vision.camera import Camera

@@ -15,7 +15,7 @@ from scipy.io import savemat
 
 from torchcss.body.rotations import about
 from torchcss.errors import CameraError
-from torchcss.io.calibrations import read_entries
+from torchcss.io.calibrations.read import read_entries
 from torchcss.io.cameras import load_camera, load_lens, read_cameras
 from torchcss.io.lenses import Mirror
 from torchcss.io.video import VideoWriter
