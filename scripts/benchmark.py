@@ -46,7 +46,7 @@ from peers.autograd_cost import joints_by_autograd, made_up_costs, made_up_frame
 from torch import Tensor
 
 from torchcss.cost.total import TrackingCost
-from torchcss.io.video import read_image
+from torchcss.io.pictures import read_image
 from torchcss.stopwatch import Stopwatch
 from torchcss.types import Curvature, LocalModel
 from torchcss.vision.features import FeatureExtractor

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import FlowFileError
-from torchcss.io.video import read_image
+from torchcss.io.pictures import read_image
 from torchcss.robust import Quadratic
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.flow import ACCURATE, TRACKING_FLOW, OpticalFlow, robust_flow

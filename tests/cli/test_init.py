@@ -17,8 +17,9 @@ from torchcss.cli import init as cli_init
 from torchcss.cli import main as cli
 from torchcss.initialise.multi_start import StartSearch
 from torchcss.initialise.options import InitialiseOptions
+from torchcss.io.pictures import read_image
 from torchcss.io.tracks import load_track
-from torchcss.io.video import VideoReader, read_image
+from torchcss.io.video import VideoReader
 from torchcss.types import Keypoints
 
 

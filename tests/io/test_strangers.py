@@ -268,7 +268,7 @@ def test_playlists_open_no_other_file(tmp_path: Path) -> None:
 def test_pictures_that_a_small_video_makes_large(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("torchcss.io.video._MOST_PIXELS", 640 * 480 - 1)
+    monkeypatch.setattr("torchcss.io.containers._MOST_PIXELS", 640 * 480 - 1)
     assert "640 x 480 pixels" in refused(VideoReader, CLIP / "video.mp4")
 
 

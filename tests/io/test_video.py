@@ -24,15 +24,9 @@ from torchcss.app.detect import detect_video
 from torchcss.app.lens import KnownLens
 from torchcss.app.view_files import OpenView, open_view
 from torchcss.errors import ConfigurationError, OutputError, ShapeError, VideoError
-from torchcss.io import video
-from torchcss.io.video import (
-    VideoReader,
-    VideoWriter,
-    missing_numbers,
-    natural_order,
-    read_image,
-    several_kinds,
-)
+from torchcss.io import pictures, video
+from torchcss.io.pictures import missing_numbers, natural_order, read_image, several_kinds
+from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.io.view_files import ViewFiles
 from torchcss.studies.demo import CLIP
 from torchcss.types import Frame
@@ -135,14 +129,14 @@ def test_times_rise(
 ) -> None:
     """Where the file's times do not, a frame is one interval after the last, from any start."""
     path = film(tmp_path / "a.mp4", len(written))
-    decode = video._decode
+    decode = video.whole_pictures
 
     def with_times(container: InputContainer) -> Iterator[av.VideoFrame]:
         for picture, time in zip(decode(container), written, strict=False):
             picture.time_base, picture.pts = Fraction(1, 30), time
             yield picture
 
-    monkeypatch.setattr(video, "_decode", with_times)
+    monkeypatch.setattr(video, "whole_pictures", with_times)
     times = [frame.time_s * 30 for frame in VideoReader(path)]
     assert times == pytest.approx(read)
     assert [frame.time_s * 30 for frame in VideoReader(path, start=2)] == pytest.approx(read[2:])
@@ -762,7 +756,7 @@ def test_pictures_of_several_sizes_are_told_at_once(
     monkeypatch.setattr(video, "read_image", None)
     reader.check_sizes()
     # Nor is one opened again that is as it was: films are detected first and tracked then.
-    monkeypatch.setattr(video, "Image", None)
+    monkeypatch.setattr(pictures, "Image", None)
     reader.check_sizes()
 
 

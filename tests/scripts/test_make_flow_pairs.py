@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from common.flow_files import read_flow
 
-from torchcss.io.video import read_image
+from torchcss.io.pictures import read_image
 from torchcss.vision.sampling import sample_bilinear
 
 

@@ -25,8 +25,9 @@ from torchcss.io.keypoints.links import Links
 from torchcss.io.keypoints.masks import OwnMasks, masks_of, read_own_masks
 from torchcss.io.keypoints.one_person import Whom
 from torchcss.io.keypoints.read import read_person
+from torchcss.io.pictures import missing_numbers, several_kinds
 from torchcss.io.run import Run
-from torchcss.io.video import VideoReader, missing_numbers, several_kinds
+from torchcss.io.video import VideoReader
 from torchcss.io.view_files import RecordedCamera, ViewFiles
 from torchcss.types import Frame, Keypoints, frozen
 from torchcss.vision.camera import Camera

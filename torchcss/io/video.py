@@ -7,9 +7,8 @@ containers only. Pictures are turned and mirrored as a telephone writes into the
 do, and high dynamic range is brought to 8 bit (`torchcss.io.high_dynamic_range`).
 
 A damaged video is read up to the damage. The frames before it are yielded, then a `VideoError` says
-how many there were; whoever consumed them keeps what was computed. An MPEG-TS does not say how long
-it is: where it ends behind a whole picture, and none is missing before that one, nothing tells that
-more was to follow.
+how many there were; whoever consumed them keeps what was computed. How damage is found is in
+`torchcss.io.containers`; single pictures are read in `torchcss.io.pictures`.
 
 By default: `for frame in VideoReader(path)` and `with VideoWriter(path, frame_rate) as writer`.
 """
@@ -18,31 +17,41 @@ from __future__ import annotations
 
 import math
 import os
-import re
-from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from contextlib import suppress
 from fractions import Fraction
-from functools import cached_property, lru_cache
-from itertools import pairwise, takewhile
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
-from torchcss.files import StrPath, naming, one_line, output_error, temporary_name
-from torchcss.io.high_dynamic_range import table
+from torchcss.files import StrPath, naming, output_error, temporary_name
+from torchcss.io.containers import (
+    Damage,
+    av_errors,
+    not_a_video,
+    open_container,
+    times_shown,
+    upright,
+    whole_pictures,
+)
+from torchcss.io.pictures import (
+    library_reason,
+    natural_order,
+    num_pictures,
+    read_image,
+    size_at_beginning,
+)
 from torchcss.joint_names import names_in
 from torchcss.types import TIME_ROUNDING, Frame
 
 if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
     from av import VideoFrame
-    from av.container import InputContainer
-    from av.video.stream import VideoStream
 
 IMAGE_SUFFIXES = names_in(".jpg .jpeg .png .bmp .tif .tiff .webp .pgm .ppm")
 """What counts as a frame in a folder of images."""
@@ -53,26 +62,10 @@ _UNREAD = names_in(".heic .heif .avif .jxl .jp2 .gif .exr .tga .dng .cr2 .cr3 .n
 VIDEO_SUFFIXES = names_in(".mp4 .mov .avi .mkv .webm .m4v .mpg .mpeg .wmv .mts .m2ts .3gp")
 """What counts as a video in a folder of clips; others are read too."""
 
-# Demuxers that make pictures out of text or of anything at all: no video comes in them. Below,
-# those of playlists, which name other files.
-_NOT_VIDEOS = {
-    *names_in("tty ansi bin xbin adf idf rawvideo subviewer"),
-    *names_in("hls applehttp concat dash imf vobsub"),
-}
-
-_MOST_PIXELS = 2**27
-"""Of a video's picture, which a small file may make large; Pillow refuses large images itself."""
-
 _SECONDS_BETWEEN_KEY_FRAMES = 1
 
 _TICKS = 90_000
 """In a second, of films whose frames have times of their own, as in most containers."""
-
-_SEGMENT = b"\x18\x53\x80\x67"
-"""What stands before the size of a Matroska file's only large part."""
-
-_PACKETS = (188, 192, 204)
-"""Bytes of the packets of which an MPEG transport stream is made."""
 
 _FOCAL_35MM = ("focal_length.35mm_equivalent", "focallengthin35mmfilm", "focallength35efl")
 """How the keys end under which cameras write the focal length as of 35 mm film."""
@@ -183,15 +176,16 @@ class VideoReader:
 
         Where an MPEG-TS ends in the middle of a picture, that one and its neighbours count as well.
         """
-        return len(self._images or self._shown_at())
+        return len(self._images or times_shown(self.path))
 
     def frame_times(self) -> list[float] | None:
         """Seconds from the first frame to each, without decoding; None: a file does not say it."""
         if self._images is not None:
             return [float(index / self.info.frame_rate) for index in range(len(self._images))]
-        times = [time for time in self._shown_at() if time is not None]
+        shown = times_shown(self.path)
+        times = [time for time in shown if time is not None]
         begin = min(times, default=0.0)
-        return sorted(time - begin for time in times) if self.count_frames() == len(times) else None
+        return sorted(time - begin for time in times) if len(times) == len(shown) else None
 
     @property
     def selected_rate(self) -> float:
@@ -230,29 +224,6 @@ class VideoReader:
             "at its own time"
         )
 
-    def _shown_at(self) -> list[float | None]:
-        """When each frame of a container is shown, in the order in which they are stored."""
-        times: list[float | None] = []
-        whole, sent, longest = None, None, 0.0
-        # What cannot be demuxed ends the count, as it ends the reading: see `_decode`.
-        with suppress(*_av_errors()), self.opened() as container:
-            for packet in container.demux(video=0):
-                if not packet.size and not _is_cut_off(container):
-                    if _lacks_some(container, times, sent, longest):
-                        break
-                    return times
-                if packet.is_corrupt or not packet.size:
-                    sent = sent if packet.size else whole
-                    break
-                shown, decoded = (
-                    None if at is None else float(at * (packet.time_base or 1))
-                    for at in (packet.pts, packet.dts)
-                )
-                times += [] if packet.is_discard else [shown]
-                longest = max(longest, _step(sent, decoded))
-                whole, sent = sent, decoded
-        return [time for time in times if _is_shown_by(time, sent)]
-
     def __iter__(self) -> Iterator[Frame]:
         return self._read_container() if self._images is None else self._read_images()
 
@@ -264,33 +235,13 @@ class VideoReader:
 
     # Containers.
 
-    def opened(self) -> InputContainer:
-        """The video's container, to be closed by the caller."""
-        import av
-        from av.error import ArgumentError
-
-        # Only this file: playlists that name other files or addresses are refused before those are
-        # opened.
-        kinds = ",".join(sorted(av.formats_available - _NOT_VIDEOS))
-        options = {"protocol_whitelist": "file", "format_whitelist": kinds}
-        try:
-            return av.open(f"file:{self.path}", container_options=options)
-        except ArgumentError as error:  # as PyAV calls what is not among these kinds
-            raise self._not_a_video("it holds text, raw bytes or a playlist") from error
-
-    def _not_a_video(self, reason: str) -> VideoError:
-        return VideoError(
-            f"{self.path}: not a video that can be read ({reason}); expected a complete "
-            "video file or a folder of images"
-        )
-
     def _probe_container(self) -> VideoInfo:
         from av.format import Flags
 
         try:
-            with self.opened() as container:
+            with open_container(self.path) as container:
                 if not container.streams.video:
-                    raise self._not_a_video("it holds no pictures")
+                    raise not_a_video(self.path, "it holds no pictures")
                 stream = container.streams.video[0]
                 rate = stream.average_rate or stream.guessed_rate or stream.base_rate
                 self.is_untimed = bool(container.format.flags & Flags.no_timestamps.value)
@@ -307,10 +258,10 @@ class VideoReader:
                     shown = [entry.timestamp for entry in stream.index_entries]
                     has_gaps = len(shown) < num_frames and shown[-1:] == [num_frames - 1]
                     num_frames = self.count_frames() if has_gaps else num_frames
-                first = next(iter(_decode(container)), None)
+                first = next(iter(whole_pictures(container)), None)
                 if first is None:
-                    raise self._not_a_video("its first frame cannot be decoded")
-                height, width = _upright(first, stream).shape[:2]
+                    raise not_a_video(self.path, "its first frame cannot be decoded")
+                height, width = upright(first, stream).shape[:2]
                 aspect = stream.sample_aspect_ratio or Fraction(1)
                 if (count := len(container.streams.video)) > 1:
                     self.left_out = (
@@ -321,8 +272,8 @@ class VideoReader:
                 self.pixel_aspect = 1 / aspect if is_turned else aspect
         except VideoError:
             raise
-        except (*_av_errors(), ValueError, _Damage) as error:
-            raise self._not_a_video(_reason(error)) from error
+        except (*av_errors(), ValueError, Damage) as error:
+            raise not_a_video(self.path, library_reason(error)) from error
         return VideoInfo(rate or Fraction(25), width, height, num_frames)
 
     def _read_container(self) -> Generator[Frame]:
@@ -331,8 +282,8 @@ class VideoReader:
         time: float | None = None
         damage = ""
         try:
-            with self.opened() as container:
-                for picture in _decode(container):
+            with open_container(self.path) as container:
+                for picture in whole_pictures(container):
                     index, num_read = num_read, num_read + 1
                     if origin is None and picture.time is not None:
                         origin = picture.time
@@ -341,7 +292,7 @@ class VideoReader:
                         return
                     if index < self._start or (index - self._start) % self._stride:
                         continue
-                    image = _upright(picture, container.streams.video[0])
+                    image = upright(picture, container.streams.video[0])
                     if image.shape[:2] != (self.info.height, self.info.width):
                         raise VideoError(
                             f"{self.path}: frame {index} has {image.shape[1]} x {image.shape[0]} "
@@ -354,8 +305,8 @@ class VideoReader:
                     damage = "the file ends early"
         except VideoError:
             raise
-        except (*_av_errors(), ValueError, _Damage) as error:
-            damage = _reason(error)
+        except (*av_errors(), ValueError, Damage) as error:
+            damage = library_reason(error)
         if self._stop is not None and num_read >= self._stop:
             return
         if damage:
@@ -409,10 +360,12 @@ class VideoReader:
         except VideoError:
             raise
         except (OSError, ValueError) as error:  # ValueError: a null character in the name
-            raise VideoError(f"{str(self.path)!r}: cannot be read: {_reason(error)}") from error
+            raise VideoError(
+                f"{str(self.path)!r}: cannot be read: {library_reason(error)}"
+            ) from error
         if self.path.suffix.lower() not in IMAGE_SUFFIXES:
             return None
-        if (count := _num_pictures(self.path)) > 1:
+        if (count := num_pictures(self.path)) > 1:
             raise VideoError(
                 f"{count} pictures in one file; save them as a folder of pictures, or as a video"
             )
@@ -431,7 +384,7 @@ class VideoReader:
         """
         for index in self._chosen:
             assert self._images is not None
-            if _size_at_beginning(self._images[index]) not in (None, self.info[1:3]):
+            if size_at_beginning(self._images[index]) not in (None, self.info[1:3]):
                 self._image(index)
 
     def _image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -522,7 +475,7 @@ class VideoWriter:
             picture.pts = max(shown, self._next)
             self._next = picture.pts + 1
             self._container.mux(self._stream.encode(picture))
-        except _av_errors() as error:
+        except av_errors() as error:
             raise output_error(self.path, error) from error
         self.num_frames += 1
 
@@ -560,7 +513,7 @@ class VideoWriter:
                 container.close()
             if self.num_frames:
                 os.replace(self._partial, self.path)
-        except _av_errors() as error:
+        except av_errors() as error:
             if self.num_frames and not self.path.exists():
                 with suppress(OSError):
                     os.replace(self._partial, self.path)
@@ -596,76 +549,6 @@ def usual_step(steps: Float[np.ndarray, " t"]) -> float:
     return float(steps[np.abs(steps - usual) < 1.5 * TIME_ROUNDING].mean())
 
 
-def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
-    """Read one image as 8-bit red, green, blue, turned upright.
-
-    16-bit grey is scaled to 8 bit; transparent images are laid over black.
-
-    Args:
-        path: An image that Pillow reads.
-
-    Returns:
-        The image `[height, width, 3]`.
-
-    Raises:
-        VideoError: If the file is missing, damaged or no image.
-    """
-    try:
-        with Image.open(path) as opened:
-            picture = ImageOps.exif_transpose(opened)
-            if picture.mode == "F":
-                raise VideoError(
-                    f"{path}: floating-point images have no fixed range; expected 8 or 16 bit"
-                )
-            if picture.mode.startswith("I"):
-                values = np.asarray(picture)
-                grey = (values.astype(np.int64).clip(0, 65535) >> 8).astype(np.uint8)
-                return np.repeat(grey[:, :, None], 3, axis=2)
-            if "A" in picture.getbands() or "transparency" in picture.info:
-                picture = picture.convert("RGBA")
-                black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
-                picture = Image.alpha_composite(black, picture)
-            return np.array(picture.convert("RGB"))
-    except VideoError:
-        raise
-    except Exception as error:  # Pillow's decoders raise whatever their format's damage leads to
-        raise VideoError(
-            f"{path}: not an image that can be read ({_reason(error)}); get a complete copy"
-        ) from error
-
-
-def _size_at_beginning(path: Path) -> tuple[int, int] | None:
-    """Columns and rows of an image, turned upright; None: nothing that can be read says it."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return _size_of_file(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(2**16)
-def _size_of_file(path: Path, _changed: int, _length: int) -> tuple[int, int] | None:
-    """The same; a file that is as it was is not opened again, as by who detects and then tracks.
-
-    What a PNG says of its turn behind the pixels is not looked for.
-    """
-    with suppress(Exception), Image.open(path) as opened:  # see `read_image`
-        width, height = opened.size
-        turn = opened.getexif().get(ExifTags.Base.Orientation, 1) if "exif" in opened.info else 1
-        return (height, width) if turn > 4 else (width, height)
-    return None
-
-
-def _num_pictures(path: Path) -> int:
-    """How many pictures of one size a file holds, as TIFF and WebP may; a small copy is none."""
-    with suppress(Exception), Image.open(path) as opened:  # see `read_image`
-        size = opened.size
-        opened.seek(1)
-        if opened.format != "MPO" and opened.size == size:  # of a telephone, for two eyes
-            return opened.n_frames  # type: ignore[attr-defined]
-    return 1
-
-
 def read_frame(path: StrPath, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     """Read one frame of a video, or one image.
 
@@ -687,7 +570,7 @@ def focal_length_35mm(path: StrPath) -> float | None:
     """
     reader = VideoReader(path)
     value: Any = None
-    with suppress(*_av_errors(), ValueError, SyntaxError):
+    with suppress(*av_errors(), ValueError, SyntaxError):
         if reader.first_image is not None:
             with Image.open(reader.first_image) as picture:
                 value = (
@@ -696,7 +579,7 @@ def focal_length_35mm(path: StrPath) -> float | None:
                     .get(ExifTags.Base.FocalLengthIn35mmFilm)
                 )
         else:
-            with reader.opened() as container:
+            with open_container(reader.path) as container:
                 said = {**container.metadata, **container.streams.video[0].metadata}
             value = next((said[key] for key in said if key.lower().endswith(_FOCAL_35MM)), None)
     try:
@@ -704,163 +587,3 @@ def focal_length_35mm(path: StrPath) -> float | None:
     except (TypeError, ValueError):
         return None
     return focal if _SHORTEST_MM <= focal <= _LONGEST_MM else None
-
-
-def natural_order(name: str) -> tuple[tuple[int, int | str], ...]:
-    """Return a sorting key in which numbers inside names count as numbers: 2 before 10."""
-    # `[0-9]` and not `\d`: the latter takes signs such as superscripts that `int` refuses.
-    parts = re.split(r"([0-9]+)", name)
-    return tuple(
-        (0, int(part)) if number else (1, part.lower())
-        for number, part in ((index % 2, part) for index, part in enumerate(parts))
-        if part
-    )
-
-
-def missing_numbers(names: Sequence[str]) -> str | None:
-    """A line about numbers that are missing between those of a folder's pictures, if there are any.
-
-    Args:
-        names: The pictures in order, most of them numbered one after another.
-    """
-    found = [re.findall(r"[0-9]+", Path(name).stem)[-1:] for name in names]
-    numbers = [int(number) for of in found for number in of]
-    steps = [after - before for before, after in pairwise(numbers)]
-    gaps = [place for place, step in enumerate(steps) if step != 1]
-    # Pictures numbered in another way, such as by time, have no gaps to tell.
-    if len(numbers) < len(names) or not gaps or len(gaps) > 0.5 * len(steps) or min(steps) < 1:
-        return None
-    return (
-        f"{sum(steps) - len(steps)} pictures are missing by their numbers, the first behind "
-        f"{names[gaps[0]]}: those beside a gap are taken to follow one another"
-    )
-
-
-def several_kinds(names: Sequence[str]) -> str | None:
-    """A line about a folder that holds pictures of several kinds; they may be the same twice."""
-    kinds = Counter(Path(name).suffix.lower() for name in names)
-    if len(kinds) < 2:
-        return None
-    told = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
-    return f"pictures of several kinds, {told}: all are taken, in the order of their names"
-
-
-def _av_errors() -> tuple[type[Exception], ...]:
-    """What PyAV raises where a file is at fault."""
-    from av.error import FFmpegError
-
-    return FFmpegError, OSError
-
-
-class _Damage(Exception):
-    """The container goes on, but not with whole frames."""
-
-
-def _decode(container: InputContainer) -> Iterator[VideoFrame]:
-    """Yield the frames of the first video stream; raise at the first damage, after those before."""
-    stream = container.streams.video[0]
-    decoder = stream.codec_context
-    if decoder is None:
-        raise _Damage("its codec is unknown")
-    # Decoding is a hundredth of a frame's work; threads of its own would each hold memory.
-    decoder.thread_count = 1
-    decoder.options = {"max_pixels": str(_MOST_PIXELS)}  # also for what grows on the way
-    if decoder.width * decoder.height > _MOST_PIXELS:
-        raise _Damage(f"{decoder.width} x {decoder.height} pixels, more than {_MOST_PIXELS:,}")
-    held: list[VideoFrame] = []
-    whole, sent = None, None  # when the last packets but one and but none were to be decoded
-    longest = 0.0
-    packets = container.demux(stream)
-    try:
-        while (packet := next(packets, None)) is not None:
-            if packet.is_corrupt:
-                raise _Damage("the file is cut off or damaged")
-            if not packet.size and _is_cut_off(container):
-                sent = whole  # half of the last one may be missing
-                raise _Damage("the file is cut off")
-            pictures = packet.decode()
-            if not packet.size and container.format.name == "mpegts":
-                held, pictures = held + pictures, []
-                is_half = any(picture.is_corrupt for picture in held)
-                if is_half or _lacks_some(container, [p.pts for p in held], sent, longest):
-                    sent = whole if is_half else sent
-                    raise _Damage("the file is cut off")
-            yield from held
-            longest = max(longest, _step(sent, packet.dts))
-            held, whole, sent = pictures, sent, packet.dts
-        yield from held
-    except (*_av_errors(), _Damage):
-        # What the decoder holds back is whole, but pictures shown before it may be lost: those that
-        # were to be decoded later, so that they are shown later than that.
-        with suppress(*_av_errors()):
-            held += decoder.decode(None)
-        yield from takewhile(lambda picture: _is_shown_by(picture.pts, sent), held)
-        raise
-
-
-def _is_shown_by(time: float | None, sent: float | None) -> bool:
-    """Whether a picture is shown when a packet was to be decoded, or before, or has no time."""
-    return time is None or (sent is not None and time <= sent)
-
-
-def _step(before: float | None, after: float | None) -> float:
-    return 0.0 if before is None or after is None else after - before
-
-
-def _lacks_some(
-    container: InputContainer, shown: Sequence[float | None], sent: float | None, longest: float
-) -> bool:
-    """Whether an MPEG-TS lacks pictures that were to be shown between its last ones.
-
-    Args:
-        container: The container.
-        shown: When its last pictures, or all, are shown.
-        sent: When the last packet was to be decoded: what is shown until then is there.
-        longest: The longest step from one packet to the next.
-    """
-    if container.format.name != "mpegts" or sent is None:
-        return False
-    late = sorted(time for time in shown if time is not None and time >= sent)
-    return any(after - before > 1.5 * longest for before, after in pairwise(late))
-
-
-def _is_cut_off(container: InputContainer) -> bool:
-    """Whether a file is shorter than it says, or ends within a packet."""
-    path = Path(container.name.removeprefix("file:"))
-    size = path.stat().st_size
-    if container.format.name == "mpegts":
-        return all(size % packet for packet in _PACKETS)
-    if "matroska" not in container.format.name:
-        return False
-    with path.open("rb") as file:
-        _, found, rest = file.read(4096).partition(_SEGMENT)
-        # As many bytes as the first one has leading zeros say the size, and one more.
-        count = 9 - rest[0].bit_length() if found and rest else 0
-        stated = int.from_bytes(rest[:count]) - (1 << 7 * count)
-        is_known = 0 < count < 9 and stated != (1 << 7 * count) - 1
-        return is_known and size < file.tell() - len(rest) + count + stated
-
-
-def _upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture as a player shows it on a screen of standard range."""
-    levels = table(int(stream.codec_context.color_trc or 0))
-    # One thread, as for decoding: on busy cores a picture waits longer for threads than it takes.
-    if levels is None:
-        image = picture.to_ndarray(format="rgb24", threads=1)
-    else:
-        deep = picture.to_ndarray(format="rgb48le", threads=1)
-        image = np.take(levels, np.asarray(deep, np.uint16))
-    # How a pixel's place (x, y) is shown: x' = a x + c y, y' = b x + d y, maybe mirrored.
-    angle = math.radians(picture.rotation)
-    a, b, c, d = math.cos(angle), -math.sin(angle), math.sin(angle), math.cos(angle)
-    with suppress(KeyError, ValueError):  # there is none, or beside it what PyAV does not know
-        data: Any = picture.side_data
-        a, b, _, c, d, *_ = np.frombuffer(data["DISPLAYMATRIX"], np.int32).tolist()
-    if abs(b) > abs(a):
-        image, a, d = image.swapaxes(0, 1), c, b
-    return np.ascontiguousarray(image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1])
-
-
-def _reason(error: Exception) -> str:
-    """One short line of what a library said."""
-    return one_line(getattr(error, "strerror", None) or error)

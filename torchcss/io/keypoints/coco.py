@@ -22,7 +22,7 @@ from torchcss.io.keypoints.people import (
     track_of,
 )
 from torchcss.io.keypoints.words import FRAMES, TRACKS, first_of
-from torchcss.io.video import natural_order
+from torchcss.io.pictures import natural_order
 from torchcss.joint_names import canonical_joint_name
 
 _TRACKS = tuple(word for word in TRACKS if word != "id")

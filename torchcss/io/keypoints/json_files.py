@@ -62,7 +62,7 @@ from torchcss.io.keypoints.words import (
     seconds_in,
     time_word,
 )
-from torchcss.io.video import natural_order
+from torchcss.io.pictures import natural_order
 from torchcss.joint_names import canonical_joint_name
 
 _FORMATS = {
