@@ -1,4 +1,4 @@
-"""One tracker step as the processor sees it: eager, compiled and fused, by body and samples.
+"""One tracker step as the processor sees it: eager, compiled and fused, whole and by stage.
 
     python scripts/profile_step.py --out profile/profile.json --folder profile
 
@@ -9,27 +9,28 @@ is of fixed shape in the search. Samples are worked off in pools of one size, th
 up, so that one graph serves any number. Compiled it is one graph (`fullgraph=True`), and is not
 compiled again for a second frame; a graph that broke or a second compilation would raise. Fused is
 what the search does on a CPU: the cost by compiled kernels, the step of `TrustRegionNewton` as
-well.
+well. What is compiled agrees with eager to rounding; planned steps in the metric of the damped
+Hessian, since a matrix that is only just definite passes its rounding on.
 
-Printed are seconds per sample and iteration (one evaluation and one step), the ratios of eager to
-compiled and to fused within a repeat, the memory that an iteration takes on top of its inputs (its
-results included), and what compiling took, with nothing from a cache. On a CPU the clock is the
-process's own, since others may use the machine; on a GPU it is the wall's. With `--folder` come the
-figure, and by body and way a table and a trace of `torch.profiler`.
+The table has the microseconds of every stage by sample and iteration and in brackets
 
-What it says on a CPU (float32, one thread): compiled is slower nowhere, 4 times as fast as eager
-for the arm in pools of 100, where eager is mostly the overhead of over a thousand calls, 2.3 times
-in pools of 500, and 1.4 to 2 times for the bodies. Cholesky factors, triangular solves and
-products, two fifths of the compiled step of a body, are the same library calls in both. One of them
-is slower when compiled, the product of the lift: inductor lays its factors out with the batch
-innermost, though the code asks for contiguous ones, and `bmm` then copies them item by item, 7
-instead of 1 microsecond for 34 parameters. Checking that a graph still fits takes 0.4 ms a call.
-A compilation takes a minute of processor time, which a body earns back after 4 million
-sample-iterations, thousands of frames with the usual 60 samples. The search on a CPU takes neither,
-but the fused engine.
+- the share of overhead, `a / (a + b N)`: what a call takes however many its samples, by the times
+  of two pools, of `N` samples and of a fifth as many;
+- how many times as long it takes as its arithmetic alone, at the rate that a product of large
+  matrices reached in the same run. `Arithmetic` counts the operations of the stages as they stand
+  in torch, with three Cholesky factors a step, and the same count goes for all ways.
 
-What is compiled agrees with eager to 2e-5 in float32; planned steps to 1e-3, in the metric of the
-damped Hessian, since a matrix that is only just definite passes its rounding on (1e-9 in float64).
+Stages of eager are timed by themselves. One graph has no stages: each is compiled by itself too,
+and timed without the checks whether its graph still fits; what overhead there is, the whole has. Of
+fused they are its kernels' calls. The rest is the whole without its stages: in the fused engine
+the packing, checking and converting of numbers, in one graph its checks, less what calls of stages
+by themselves take more. Eager's priors find the poses once more, as they would alone.
+
+A report also has the ratios of eager to compiled and to fused within a repeat, the memory that an
+iteration takes on top of its inputs (its results included), and what compiling took, with nothing
+from a cache. On a CPU the clock is the process's own, since others may use the machine; on a GPU it
+is the wall's. With `--folder` come the figure, and by body and way a table and a trace of
+`torch.profiler`.
 """
 
 from __future__ import annotations
@@ -37,31 +38,77 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
-from common import Table, finish, quartiles, start
+from common import Table, quartiles, start, write_report
 from matplotlib.figure import Figure
+from peers.fixed_step import scaled_draw
 from peers.tracker_step import (
+    STAGES,
+    FrameData,
     Step,
     Work,
     compile_step,
+    compile_whole,
     fused_step,
     make_frames,
+    operations,
     profiled,
     tracker_step,
 )
+from torch import Tensor
+from torch._inductor.utils import fresh_inductor_cache
 
+from torchcss.cost.fused import engine
 from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder
+from torchcss.inference import trust_region
+from torchcss.kernels import checked
 from torchcss.show.style import save_figure
 from torchcss.tracking.settings import Settings
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+REST, ALL = "the rest", "all"
+KERNELS = {"add_view": "keypoints", "advance": "planning"}
+"""Stages of the fused engine's kernels by name; others are of priors."""
+REASONS = {
+    "drawing": (
+        "A product of a matrix and a vector a sample, which reads a number for every two "
+        "operations, made for every place, fresh or not."
+    ),
+    "keypoints": (
+        "Eager is 900 calls on a few kilobytes each; the kernels go along the tree joint by joint, "
+        "every sum waiting for the one before, fused ones in double precision."
+    ),
+    "priors": (
+        "Eager is 330 calls, which fill a matrix for every diagonal; in kernels it is a division "
+        "and a logarithm a parameter, each counted as one operation."
+    ),
+    "planning": (
+        "Eager and compiled give three dampings to a library matrix by matrix, which are too small "
+        "for it; in the kernel a row is five registers and fewer, and roots wait for one another."
+    ),
+    REST: (
+        "Compiled, a call checks that its graph still fits; fused, results are turned from double "
+        "into single precision and checked, and the state is copied."
+    ),
+}
+"""Why a stage is not faster."""
+SMALLER = 5
+"""The pool that tells the overhead has so many times fewer samples."""
+PRODUCT = 1024
+"""Rows and columns of the matrices whose product tells the rate of arithmetic."""
+Seconds = dict[str, dict[str, float]]
+"""Times by way and stage."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,61 +148,198 @@ class Config:
         if self.device.partition(":")[0] not in ("cpu", "cuda"):
             raise ConfigurationError(f"device: expected cpu or cuda, got {self.device!r}")
         Settings(device=self.device)  # refuses one that is not here
+        if min(*self.samples, self.pool) < 2:
+            raise ConfigurationError("samples, pool: expected at least 2: one has no overhead")
 
 
-def seconds_of(config: Config, work: Work, step: Step) -> float:
-    """Mean time of one iteration of all samples."""
+class Ways(NamedTuple):
+    """A step in all ways.
+
+    Attributes:
+        steps: The step by way.
+        stages: Its stages by way and name, where they can be called by themselves.
+        found: What compiling took, and how far apart the results are.
+    """
+
+    steps: dict[str, Step]
+    stages: dict[str, Mapping[str, Callable[..., Any]]]
+    found: dict[str, Any]
+
+
+def ways_of(config: Config, frames: Iterator[FrameData]) -> Ways:
+    """Compile the step of a body."""
+    steps: dict[str, Step] = {"eager": tracker_step}
+    if not config.device.startswith("cuda") and (fused := fused_step(config.dtype)) is not None:
+        steps["fused"] = fused
+    steps["compiled"], found = compile_step(frames, math.sqrt(config.covariance_scale))
+    compiled = {name: compile_whole(stage) for name, stage in STAGES.items()}
+    return Ways(steps, {"eager": STAGES, "compiled": compiled}, found)
+
+
+def works_of(config: Config, ways: Ways, frame: FrameData, samples: int) -> dict[str, Work]:
+    """Samples of a frame for every way, in pools for which all is compiled then."""
+    scale = math.sqrt(config.covariance_scale)
+    works = {way: Work(frame, samples, scale) for way in ways.steps}
+    for way, step in ways.steps.items():
+        works[way].iterate(step)
+        works[way].iterate(step)
+    for stage in (stage for stages in ways.stages.values() for stage in stages.values()):
+        works["eager"].call(stage)
+    return works
+
+
+def seconds_of(config: Config, call: Callable[[], Any]) -> float:
+    """Mean time of a call."""
     gpu, calls = config.device.startswith("cuda"), 0
     clock = time.perf_counter if gpu else time.process_time
     begin = now = clock()
     while calls == 0 or now - begin < config.at_least_s:
-        work.iterate(step)
+        call()
         if gpu:
             torch.cuda.synchronize()
         calls, now = calls + 1, clock()
     return (now - begin) / calls
 
 
-def measure(config: Config, body: str) -> Iterator[dict[str, Any]]:
+def fused_stages(config: Config, work: Work, step: Step) -> dict[str, float]:
+    """Times of an iteration's kernels; what is drawn is drawn by torch."""
+    spent, calls = dict.fromkeys(STAGES, 0.0), 0
+
+    def run(kernel: Callable[..., None], *arguments: Any) -> None:
+        begin = time.process_time()
+        checked.run(kernel, *arguments)
+        spent[KERNELS.get(kernel.__name__, "priors")] += time.process_time() - begin
+
+    def iterate() -> None:
+        nonlocal calls
+        work.iterate(step)
+        calls += 1
+
+    def draw(frame: FrameData, _: Any, __: Tensor, scale: float) -> Tensor:
+        return scaled_draw(frame.mean, frame.factor, frame.noise, scale)
+
+    with patch.object(engine, "run", run), patch.object(trust_region, "run", run):
+        seconds_of(config, iterate)
+    times = {name: seconds / calls for name, seconds in spent.items()}
+    return times | {"drawing": seconds_of(config, partial(work.call, draw))}
+
+
+def seconds_by_stage(config: Config, ways: Ways, works: Mapping[str, Work]) -> Seconds:
+    """Times of an iteration of all samples, whole and by stage."""
+    times: Seconds = {}
+    for way, step in ways.steps.items():
+        work = works[way]
+        times[way] = {ALL: seconds_of(config, partial(work.iterate, step))}
+        if way == "fused":
+            times[way] |= fused_stages(config, work, step)
+        with torch.compiler.set_stance("default", skip_guard_eval_unsafe=True):
+            for name, stage in ways.stages.get(way, {}).items():
+                call = partial(works["eager"].call, stage)
+                times[way][name] = seconds_of(config, call)
+        if len(times[way]) > 1:
+            times[way][REST] = times[way][ALL] - sum(times[way][name] for name in STAGES)
+    return times
+
+
+def rate_of_products(config: Config) -> float:
+    """Floating-point operations a second in a product of large matrices."""
+    like = torch.empty(0, dtype=getattr(torch, config.dtype), device=config.device)
+    matrix = torch.ones(PRODUCT, PRODUCT).to(like)
+    product = partial(torch.mm, matrix, matrix)
+    product()
+    times = [seconds_of(config, product) for _ in range(config.repeats)]
+    return 2 * PRODUCT**3 / float(np.median(times))
+
+
+def measure(config: Config, body: str, rate: float) -> Iterator[dict[str, Any]]:
     """The rows of one body."""
     like = torch.empty(0, dtype=getattr(torch, config.dtype), device=config.device)
-    pool, found, ways = 0, {}, {"eager": tracker_step}
-    on_cpu = not config.device.startswith("cuda")
-    if on_cpu and (fused := fused_step(config.dtype)) is not None:
-        ways["fused"] = fused
-    scale = math.sqrt(config.covariance_scale)
-    for samples in sorted(config.samples):
-        size = math.ceil(samples / math.ceil(samples / config.pool))
-        frames = make_frames(body, size, like, config.seed)
-        if size != pool:
-            pool = size
-            ways["compiled"], found = compile_step(frames, scale, cached=config.cached)
-        frame = next(frames)
-        work = {name: Work(frame, samples, scale) for name in ways}
-        row: dict[str, Any] = {"body": body, "samples": samples, "pool": pool, **found}
-        for name, step in ways.items():
-            work[name].iterate(step)
-            with tempfile.TemporaryDirectory() as scratch:
-                stem = (config.folder or Path(scratch)) / f"{body}_{samples}_{name}"
-                runs = [
-                    profiled(work[name], step, stem.with_suffix(".json"), config.rows)
-                    for _ in range(config.repeats)
-                ]
-                stem.with_suffix(".txt").write_text(runs[-1][1])
-            # The profiler's clock is the wall's, so that one run may be disturbed.
-            row[name] = {key: float(np.median([run[0][key] for run in runs])) for key in runs[0][0]}
-        rounds = [
-            {name: seconds_of(config, work[name], step) / samples for name, step in ways.items()}
+
+    def size_of(samples: int) -> int:
+        return math.ceil(samples / math.ceil(samples / config.pool))
+
+    for pool, several in groupby(sorted(config.samples), size_of):
+        smaller = max(1, pool // SMALLER)
+        frames = make_frames(body, pool, like, config.seed)
+        frame = next(make_frames(body, smaller, like, config.seed))
+        with nullcontext() if config.cached else fresh_inductor_cache():
+            ways = ways_of(config, frames)
+            # One graph has no stages; its stages by themselves are not compiled twice.
+            few = ways._replace(stages={"eager": STAGES})
+            fewer = works_of(config, few, frame, smaller)
+            frame = next(frames)
+            works_of(config, ways, frame, pool)
+        for samples in several:
+            works = works_of(config, ways, frame, samples)
+            rounds = [
+                (seconds_by_stage(config, few, fewer), seconds_by_stage(config, ways, works))
+                for _ in range(config.repeats)
+            ]
+            needed = operations(works["eager"])
+            row = {"body": body, "samples": samples, "pool": pool, "operations": needed}
+            row |= ways.found | of_rounds(rounds, (smaller, pool, samples), needed, rate)
+            for way, step in ways.steps.items():
+                stem = f"{body}_{samples}_{way}"
+                row[way] |= profile_of(config, works[way], step, stem)
+            yield row
+
+
+def of_rounds(
+    rounds: Sequence[tuple[Seconds, Seconds]],
+    sizes: tuple[int, int, int],
+    needed: Mapping[str, float],
+    rate: float,
+) -> dict[str, Any]:
+    """What the times say of every way and its stages; `stage_of` has the arguments."""
+    found: dict[str, Any] = {"times_as_fast": {}}
+    for way in rounds[0][1]:
+        stages = {
+            name: stage_of(
+                [(few[way].get(name, math.nan), many[way][name]) for few, many in rounds],
+                sizes,
+                needed.get(name, math.nan) / rate,
+            )
+            for name in (*STAGES, REST, ALL)
+        }
+        seconds = quartiles([many[way][ALL] / sizes[-1] for _, many in rounds])
+        found[way] = {"seconds": seconds, "stages": stages}
+        if way != "eager":
+            ratios = [many["eager"][ALL] / many[way][ALL] for _, many in rounds]
+            found["times_as_fast"][way] = quartiles(ratios)
+    return found
+
+
+def stage_of(
+    rounds: Sequence[tuple[float, float]], sizes: tuple[int, int, int], arithmetic: float
+) -> dict[str, float]:
+    """Seconds a sample, share of overhead, and times the seconds of the arithmetic.
+
+    Args:
+        rounds: Seconds of a call with fewer samples, and of an iteration of all.
+        sizes: How many samples the first call has, a call of the iteration, and all its calls.
+        arithmetic: Seconds a sample.
+    """
+    (smaller, pool, samples), shares = sizes, []
+    for few, many in rounds:
+        call = many * pool / samples
+        grows = (call - few) / (pool - smaller) * pool
+        shares.append(np.clip(1 - grows / call, 0.0, 1.0) if call > 0 else math.nan)
+    seconds = float(np.median([many for _, many in rounds])) / samples
+    share = float(np.median(shares))
+    return {"seconds": seconds, "overhead": share, "times_arithmetic": seconds / arithmetic}
+
+
+def profile_of(config: Config, work: Work, step: Step, stem: str) -> dict[str, Any]:
+    """Memory and share of library calls, medians; the table and the trace go into the folder."""
+    with tempfile.TemporaryDirectory() as scratch:
+        path = (config.folder or Path(scratch)) / stem
+        runs = [
+            profiled(work, step, path.with_suffix(".json"), config.rows)
             for _ in range(config.repeats)
         ]
-        for name in ways:
-            row[name]["seconds"] = quartiles([times[name] for times in rounds])
-        row["times_as_fast"] = {
-            name: quartiles([times["eager"] / times[name] for times in rounds])
-            for name in ways
-            if name != "eager"
-        }
-        yield row
+        path.with_suffix(".txt").write_text(runs[-1][1])
+    # The profiler's clock is the wall's, so that one run may be disturbed.
+    return {key: float(np.median([run[0][key] for run in runs])) for key in runs[0][0]}
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
@@ -181,19 +365,22 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _ways(row: dict[str, Any]) -> list[str]:
-    """The ways that a row has, eager first."""
-    return ["eager", *row["times_as_fast"]]
-
-
-def cells_of(row: dict[str, Any], name: str) -> list[str | float]:
-    """A way's line of the table: microseconds per sample and iteration, medians."""
-    way, ratio = row[name], "1"
-    if name != "eager":
-        low, middle, high = row["times_as_fast"][name].values()
-        ratio = f"{middle:.2f} ({low:.2f} to {high:.2f})"
-    label = f"{row['body']}, {row['samples']} samples, {name}"
-    return [label, 1e6 * way["seconds"]["median"], ratio, way["memory_mib"], way["library_share"]]
+def lines_of(row: dict[str, Any]) -> Iterator[list[str | float]]:
+    """A row's lines of the table: its stages, and how many times as fast a step is."""
+    ways = ["eager", *row["times_as_fast"]]
+    for name in (*STAGES, REST, ALL):
+        line: list[str | float] = [f"{row['body']}, {row['samples']} samples: {name}"]
+        line.append(1e-3 * row["operations"].get(name, math.nan))
+        for stage in (row[way]["stages"][name] for way in ways):
+            shares = (f"{stage['overhead']:.0%}", f"{stage['times_arithmetic']:.2g} x")
+            known = [text for text in shares if "nan" not in text]
+            line.append(f"{1e6 * stage['seconds']:.3g}" + f" ({', '.join(known)})" * bool(known))
+        yield [*line, REASONS.get(name, "")]
+    ratios = [
+        f"{ratio['median']:.2f} ({ratio['lower_quartile']:.2f} to {ratio['upper_quartile']:.2f})"
+        for ratio in row["times_as_fast"].values()
+    ]
+    yield [f"{row['body']}, {row['samples']} samples: times as fast", math.nan, "1", *ratios, ""]
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -201,19 +388,26 @@ def main(config: Config) -> dict[str, Any]:
     torch.set_num_threads(config.threads)
     if config.folder is not None:
         prepare_output_folder(config.folder)
-    rows = []
-    for row in (row for body in config.bodies for row in measure(config, body)):
+    rows, rate = [], rate_of_products(config)
+    for row in (row for body in config.bodies for row in measure(config, body, rate)):
         rows.append(row)
         print(f"{row['body']}, {row['samples']} samples: compiled in "
               f"{row['compile']['wall_s']:.0f} s, apart from eager by "
               f"{max(row['relative_difference'].values()):.1e}", flush=True)  # fmt: skip
-    report = {"rows": rows, "config": config, "torch": torch.__version__}
+    report = {"operations_a_second": rate, "rows": rows, "config": config}
     if config.folder is not None:
         save_figure(picture(rows), config.folder / "profile.png", dpi=100)
     title = f"A step eager, compiled and fused, {config.dtype} on {config.device}"
-    columns = ("body", "microseconds", "times as fast", "MiB", "library's share")
-    table = Table(title, columns, [cells_of(row, name) for row in rows for name in _ways(row)])
-    return finish(config.out, report, table)
+    heads = (
+        "body: stage",
+        "kflop",
+        *(f"{way}, µs" for way in ["eager", *rows[0]["times_as_fast"]]),
+    )
+    lines = [line for row in rows for line in lines_of(row)]
+    Table(title, heads, [line[:-1] for line in lines]).print()
+    report["torch"] = torch.__version__
+    write_report(config.out, report, Table(title, (*heads, "why it is not faster"), lines))
+    return report
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""One tracker step of fixed shape: frames to run it on, its compilation, and a comparison."""
+"""One tracker step of fixed shape, its stages, frames to run it on, and its compilation."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from peers.fixed_step import FixedStepState, fixed_step, refill, scaled_draw, start
 from torch import Tensor
 from torch._dynamo.utils import counters
-from torch._inductor.utils import fresh_inductor_cache
 from torch.profiler import ProfilerActivity, profile
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from torchcss.body.model import BodyPose
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import FrameContext
 from torchcss.cost.fused.engine import fused_engine
@@ -26,8 +27,9 @@ from torchcss.cost.joints import JointTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.inference.trust_region import TrustRegionNewton
+from torchcss.kernels import compiler
 from torchcss.studies.reprojection import reprojection_problem
-from torchcss.types import Keypoints, Status
+from torchcss.types import Keypoints, LocalModel, Status
 
 FRAME_INTERVAL = 1 / 25
 NUM_MODES = 3
@@ -42,23 +44,111 @@ class FrameData(NamedTuple):
 
     Attributes:
         cost: Keypoints, sticky and temporal priors.
+        image: The keypoints alone.
+        prior: The priors alone.
         mean: The mode that each sample is drawn about.
         factor: A factor of its covariance.
         noise: Standard normal numbers.
     """
 
     cost: TrackingCost
+    image: TrackingCost
+    prior: TrackingCost
     mean: Tensor
     factor: Tensor
     noise: Tensor
+
+
+class _Given(NamedTuple):
+    """A cost that is known already, as far as a step asks for it."""
+
+    model: LocalModel
+
+    def local_model(self, _: Tensor) -> LocalModel:
+        """The same everywhere."""
+        return self.model
+
+
+def _draw(frame: FrameData, state: FixedStepState, fresh: Tensor, scale: float) -> FixedStepState:
+    return refill(state, fresh, scaled_draw(frame.mean, frame.factor, frame.noise, scale))
+
+
+def _see(frame: FrameData, state: FixedStepState, _: Tensor, __: float) -> LocalModel:
+    return frame.image.local_model(state.x)
+
+
+def _know(frame: FrameData, state: FixedStepState, _: Tensor, __: float) -> LocalModel:
+    return frame.prior.local_model(state.x)
+
+
+def _plan(frame: FrameData, state: FixedStepState, _: Tensor, __: float) -> tuple[Any, Tensor]:
+    given: Any = _Given(state.model)
+    return fixed_step(given, state, frame.cost.body.bounds)
+
+
+def _pose(frame: FrameData, state: FixedStepState, _: Tensor, __: float) -> BodyPose:
+    return frame.cost.body.pose(state.x)
+
+
+STAGES: dict[str, Callable[[FrameData, FixedStepState, Tensor, float], Any]] = {
+    "drawing": _draw,
+    "keypoints": _see,
+    "priors": _know,
+    "planning": _plan,
+}
+"""The stages of a step by themselves, each from the state before the step."""
 
 
 def tracker_step(
     frame: FrameData, state: FixedStepState, fresh: Tensor, deviation_scale: float
 ) -> tuple[FixedStepState, Tensor]:
     """Draw where a place is fresh; then evaluate, accept or refuse, and plan for all."""
-    drawn = scaled_draw(frame.mean, frame.factor, frame.noise, deviation_scale)
-    return fixed_step(frame.cost, refill(state, fresh, drawn), frame.cost.body.bounds)
+    drawn = _draw(frame, state, fresh, deviation_scale)
+    return fixed_step(frame.cost, drawn, frame.cost.body.bounds)
+
+
+class Arithmetic(TorchDispatchMode):
+    """Counts the floating-point operations of torch's calls, in `total`.
+
+    Two for each number of a product's left factor that is not zero and column of the right one, a
+    third of n^3 for a Cholesky factor, n^2 for a triangular solution, one for every number that
+    comes out of a function of single numbers (`addcmul`: two) or goes into a sum. What is copied,
+    chosen, compared or laid out anew counts nothing.
+    """
+
+    total = 0.0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.overloadpacket.__name__
+        if name in ("mm", "bmm"):
+            self.total += 2 * int(args[0].count_nonzero()) * args[1].shape[-1]
+        elif name == "linalg_cholesky_ex":
+            self.total += args[0].numel() * args[0].shape[-1] / 3
+        elif name == "linalg_solve_triangular":
+            self.total += args[1].numel() * args[1].shape[-2]
+        elif torch.Tag.reduction in func.tags:
+            self.total += args[0].numel() * args[0].is_floating_point()
+        elif torch.Tag.pointwise in func.tags and name not in ("where", "clone", "copy_"):
+            times = 2 if name.startswith("addcmul") else 1
+            self.total += times * result.numel() * result.is_floating_point()
+        return result
+
+
+def operations(work: Work) -> dict[str, float]:
+    """Floating-point operations a sample of every stage, as `STAGES` stand in torch, and of `all`.
+
+    Args:
+        work: What eager steps have worked on.
+    """
+    found = {}
+    for name, stage in {**STAGES, "pose": _pose}.items():
+        # Else poses are found by a compiled kernel, which is no call of torch.
+        with patch.object(compiler, "AVAILABLE", False), Arithmetic() as counted:
+            work.call(stage)
+        found[name] = counted.total / (len(work.states) * len(work.fresh))
+    found["priors"] -= found.pop("pose")  # those of the keypoints
+    return {**found, "all": sum(found.values())}
 
 
 def fused_step(dtype: Literal["float32", "float64"]) -> Step | None:
@@ -104,7 +194,9 @@ def make_frames(body_name: str, pool: int, like: Tensor, seed: int) -> Iterator[
         parents = Prior.of(GaussianMixture(mean, alike, mean.new_zeros(len(mean))))
         cost = TrackingCost(choice=choice, views=(view,))
         cost = cost.of_children(torch.arange(len(mean), device=mean.device), parents)
-        yield FrameData(cost, mean, factor, noise)
+        image = replace(cost, choice=choice.only(["joints"]))
+        prior = replace(cost, choice=choice.without("joints"))
+        yield FrameData(cost, image, prior, mean, factor, noise)
 
 
 def difference(
@@ -142,40 +234,45 @@ class Work:
             start(frame.mean) for _ in range(math.ceil(samples / len(frame.mean)))
         ]
 
+    def call(self, step: Callable[..., Any]) -> list[Any]:
+        """Call a step, or a stage of one, for every pool; states stay as they are."""
+        return [step(self.frame, state, self.fresh, self.scale) for state in self.states]
+
     def iterate(self, step: Step) -> None:
         """One iteration of every sample; the first draws them."""
-        self.states = [step(self.frame, s, self.fresh, self.scale)[0] for s in self.states]
+        self.states = [state for state, _ in self.call(step)]
         self.fresh = torch.zeros_like(self.fresh)
 
 
-def compile_step(
-    frames: Iterator[FrameData], scale: float, *, cached: bool
-) -> tuple[Step, dict[str, Any]]:
+def compile_whole(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A step or stage as one graph of tensors of fixed shapes; kernels have names in profiles."""
+    options: dict[str, Any] = {"cpp.enable_kernel_profile": True}
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options)
+
+
+def compile_step(frames: Iterator[FrameData], scale: float) -> tuple[Step, dict[str, Any]]:
     """Compile, and compare with eager in three iterations of each of two frames.
 
     Whatever is compiled after the first call raises, as does a graph that breaks.
     """
     torch._dynamo.reset()
     counters.clear()
-    # Named kernels show up in the profiler's tables.
-    options: dict[str, Any] = {"cpp.enable_kernel_profile": True}
-    compiled: Step = torch.compile(tracker_step, fullgraph=True, dynamic=False, options=options)
+    compiled: Step = compile_whole(tracker_step)
     took, apart = {}, {}
-    with nullcontext() if cached else fresh_inductor_cache():
-        for frame in (next(frames), next(frames)):
-            work = Work(frame, 1, scale)
-            for _ in range(3):
-                arguments = (frame, work.states[0], work.fresh, scale)
-                wall, cpu = time.perf_counter(), time.process_time()
-                with torch._dynamo.config.patch(error_on_recompile=bool(took)):
-                    ours = compiled(*arguments)
-                took = took or {
-                    "wall_s": time.perf_counter() - wall,
-                    "cpu_s": time.process_time() - cpu,
-                }
-                for name, value in difference(ours, tracker_step(*arguments)).items():
-                    apart[name] = max(value, apart.get(name, 0.0))
-                work.states, work.fresh = [ours[0]], torch.zeros_like(work.fresh)
+    for frame in (next(frames), next(frames)):
+        work = Work(frame, 1, scale)
+        for _ in range(3):
+            arguments = (frame, work.states[0], work.fresh, scale)
+            wall, cpu = time.perf_counter(), time.process_time()
+            with torch._dynamo.config.patch(error_on_recompile=bool(took)):
+                ours = compiled(*arguments)
+            took = took or {
+                "wall_s": time.perf_counter() - wall,
+                "cpu_s": time.process_time() - cpu,
+            }
+            for name, value in difference(ours, tracker_step(*arguments)).items():
+                apart[name] = max(value, apart.get(name, 0.0))
+            work.states, work.fresh = [ours[0]], torch.zeros_like(work.fresh)
     graphs = counters["stats"]["unique_graphs"]
     return compiled, {"compile": took, "graphs": graphs, "relative_difference": apart}
 

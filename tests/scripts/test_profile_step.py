@@ -23,8 +23,8 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="compiling needs a C++ 
 
 def test_small_mode(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     out = tmp_path / "tables" / "profile.json"
-    options = ("--bodies=arm8", "--samples", "30", "--repeats=1", "--at-least-s=0", "--cached")
-    where = (f"--out={out}", f"--folder={tmp_path}", "--dtype=float64")
+    options = ("--bodies=arm8", "--samples", "30", "--repeats=1", "--cached")
+    where = (f"--out={out}", f"--folder={tmp_path}", "--dtype=float64", "--at-least-s=0.02")
     command = [sys.executable, str(SCRIPT), *options, *where]
     # Kernels without vector instructions are compiled sooner and are the same on every machine. In
     # a cache of their own: the compiler would take vector code for theirs.
@@ -47,9 +47,28 @@ def test_small_mode(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) ->
         assert row[way]["seconds"]["median"] > 0
         assert row[way]["memory_mib"] > 0
         assert 0 <= row[way]["library_share"] < 1
+        stages = row[way]["stages"]
+        rest, whole = stages.pop("the rest"), stages.pop("all")
+        assert set(stages) == {"drawing", "keypoints", "priors", "planning"}
+        assert whole["seconds"] == pytest.approx(row[way]["seconds"]["median"])
+        own = sum(stage["seconds"] for stage in stages.values())
+        assert own + rest["seconds"] == pytest.approx(whole["seconds"])
+        assert own < 1.5 * whole["seconds"]
+        for stage in (*stages.values(), whole):
+            assert stage["seconds"] > 0
+            if way == "compiled" and stage is not whole:
+                assert stage["overhead"] is None  # it is the whole graph's
+            else:
+                assert 0 <= stage["overhead"] <= 1
+            assert stage["times_arithmetic"] > 1
         stem = tmp_path / f"arm8_30_{way}"
         assert "cholesky" in stem.with_suffix(".txt").read_text() or way != "compiled"
         assert json.loads(stem.with_suffix(".json").read_text())["traceEvents"]
+    needed = row["operations"]
+    # A triangular factor times noise, by the scale and to the mean; Cholesky of three dampings.
+    assert needed["drawing"] == 2 * 36 + 8 + 8
+    assert needed["planning"] > 3 * 8**3 / 3
+    assert needed["all"] == pytest.approx(sum(needed[name] for name in stages))
     assert (tmp_path / "profile.png").is_file()
     assert "arm8" in run.stdout
     assert "times as fast" in run.stdout
