@@ -372,7 +372,10 @@ def lines_of(row: dict[str, Any]) -> Iterator[list[str | float]]:
         line: list[str | float] = [f"{row['body']}, {row['samples']} samples: {name}"]
         line.append(1e-3 * row["operations"].get(name, math.nan))
         for stage in (row[way]["stages"][name] for way in ways):
-            shares = (f"{stage['overhead']:.0%}", f"{stage['times_arithmetic']:.2g} x")
+            shares = (
+                f"{stage['overhead']:.0%}",
+                f"{round(stage['times_arithmetic'], 1):g} x",
+            )
             known = [text for text in shares if "nan" not in text]
             line.append(f"{1e6 * stage['seconds']:.3g}" + f" ({', '.join(known)})" * bool(known))
         yield [*line, REASONS.get(name, "")]
@@ -394,18 +397,18 @@ def main(config: Config) -> dict[str, Any]:
         print(f"{row['body']}, {row['samples']} samples: compiled in "
               f"{row['compile']['wall_s']:.0f} s, apart from eager by "
               f"{max(row['relative_difference'].values()):.1e}", flush=True)  # fmt: skip
-    report = {"operations_a_second": rate, "rows": rows, "config": config}
+    made = {"config": config, "torch": torch.__version__}
+    report = {"operations_a_second": rate, "rows": rows, **made}
     if config.folder is not None:
         save_figure(picture(rows), config.folder / "profile.png", dpi=100)
     title = f"A step eager, compiled and fused, {config.dtype} on {config.device}"
     heads = (
-        "body: stage",
+        "body, samples: stage",
         "kflop",
         *(f"{way}, µs" for way in ["eager", *rows[0]["times_as_fast"]]),
     )
     lines = [line for row in rows for line in lines_of(row)]
     Table(title, heads, [line[:-1] for line in lines]).print()
-    report["torch"] = torch.__version__
     write_report(config.out, report, Table(title, (*heads, "why it is not faster"), lines))
     return report
 
