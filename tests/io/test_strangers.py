@@ -226,7 +226,8 @@ def test_frames_that_are_far_away(tmp_path: Path) -> None:
 def test_matlab_that_unpacks_to_more_than_there_is(tmp_path: Path) -> None:
     path = tmp_path / "a.mat"
     packed = zlib.compress(bytes(2**26), 9)
-    path.write_bytes(bytes(126) + b"IM" + struct.pack("<II", 15, len(packed)) + packed)
+    head = b"MATLAB 5.0".ljust(124) + b"\x00\x01IM"
+    path.write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
     tracemalloc.start()
     with pytest.raises(TorchcssError, match="not a calibration"):
         load_camera(path)

@@ -10,9 +10,8 @@ Call `read_matlab`, for a script `read_bouguet`.
 from __future__ import annotations
 
 import re
-import struct
-import zlib
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,9 @@ from torchcss.errors import CameraError
 from torchcss.files import read_bytes, read_text, refusing, unexpected
 from torchcss.io.calibrations.content import one_camera
 from torchcss.io.calibrations.entry import Entry, entry_of
+from torchcss.io.calibrations.mat_elements import MOST_UNPACKED, check_mat_elements
 from torchcss.io.calibrations.matrices import has_camera
 from torchcss.io.keypoints.words import plain_word
-
-MOST_UNPACKED = 2**26
-"""Bytes of the largest calibration, unpacked; MATLAB's hold the pictures' corners too."""
 
 _OPENCV = re.compile("mtx$|cameramatrix$|dist(ortion)?(coef|$)")
 """OpenCV's names of K and of a lens's coefficients."""
@@ -40,13 +37,13 @@ def read_matlab(path: Path) -> dict[str, Entry]:
     """
     from scipy.io import loadmat  # takes a second to import
 
-    data = read_bytes(path, CameraError, 128)
+    data = read_bytes(path, CameraError, MOST_UNPACKED)
     if b"HDF" in data[:16] or data.startswith(b"MATLAB 7.3"):
         raise CameraError(f"{path}: of version 7.3; save it with save('-v7')")
-    _check_size(path)
     # SciPy raises whatever the damage leads to.
     with refusing(CameraError, f"{path}: cannot be read as MATLAB's"):
-        content = loadmat(path, simplify_cells=True)
+        check_mat_elements(data)
+        content = loadmat(BytesIO(data), simplify_cells=True)
     values = {key: _listed(each) for key, each in content.items() if not key.startswith("__")}
     for each in [each for each in values.values() if isinstance(each, dict)]:
         pair = {n: each.get(f"CameraParameters{n}") for n in "12"}
@@ -81,23 +78,10 @@ def read_bouguet(path: Path) -> dict[str, Entry]:
     )
 
 
-def _check_size(path: Path) -> None:
-    """Refuse a file that unpacks to more than a calibration, before any of it is unpacked."""
-    data, at, total = read_bytes(path, CameraError), 128, 0
-    order = ">" if data[126:128] == b"MI" else "<"
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, at)
-        packed, at = data[at + 8 : at + 8 + size], at + 8 + size
-        if kind == 15:
-            with refusing(CameraError, f"{path}: damaged", advice="get a complete copy"):
-                packed = zlib.decompressobj().decompress(packed, MOST_UNPACKED)
-        total += len(packed)
-        if total >= MOST_UNPACKED:
-            raise CameraError(f"{path}: more than {MOST_UNPACKED:,} bytes; not a calibration")
-
-
 def _listed(value: Any) -> Any:
-    """Arrays as lists, in structures too."""
+    """Arrays as lists, in structures too; None for sparse ones, which no calibration has."""
     if isinstance(value, dict):
         return {key: _listed(each) for key, each in value.items()}
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    return value if isinstance(value, (str, int, float, complex)) else None

@@ -38,7 +38,8 @@ from torchcss.files import load_array, load_arrays, load_json, naming, read_byte
 from torchcss.io.calibrations.colmap import COLMAP_NAMES, read_colmap
 from torchcss.io.calibrations.content import cameras_of
 from torchcss.io.calibrations.entry import Entry
-from torchcss.io.calibrations.matlab import MOST_UNPACKED, read_bouguet, read_matlab
+from torchcss.io.calibrations.mat_elements import MOST_UNPACKED
+from torchcss.io.calibrations.matlab import read_bouguet, read_matlab
 from torchcss.io.calibrations.qualisys import read_qualisys
 from torchcss.io.calibrations.text import BY_HAND, read_calibration_text
 from torchcss.io.calibrations.toml_files import read_calibration_toml
