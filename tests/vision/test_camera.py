@@ -225,6 +225,7 @@ def test_maximum_radius_is_where_the_distortion_stops_growing() -> None:
     torch.testing.assert_close(
         make_camera([-0.3, 0.0, 0.0, 0.0, 0.0]).maximum_radius.item(), math.sqrt(1.0 / 0.9)
     )
+    assert 0 < make_camera([0.0, -3.6e307, 0.0, 0.0, 1e308]).maximum_radius < 1e-40
     k1, k2, _, _, k3 = WILD
     r = np.linspace(0.0, 2.0, 200001)
     distorted = r * (1.0 + k1 * r**2 + k2 * r**4 + k3 * r**6)

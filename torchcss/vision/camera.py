@@ -704,8 +704,8 @@ def _monotonic_radius(distortion: Float[Tensor, " 5"]) -> Float[Tensor, ""]:
     terms, small in any real lens, are left out.
     """
     k1, k2, _, _, k3 = distortion.tolist()
-    terms = (7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0)
-    roots = np.roots([term if abs(term) > 1e-100 else 0.0 for term in terms])  # 1 / term is finite
+    terms = np.clip([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0], -1e100, 1e100)
+    roots = np.roots(np.where(np.abs(terms) > 1e-100, terms, 0.0))  # quotients are finite
     real = roots.real[np.abs(roots.imag) <= 1.0e-9 * np.abs(roots)]
     ends = [math.sqrt(root) for root in real if root > 0.0]
     for k, power in ((k1, 3), (k2, 5), (k3, 7)):
