@@ -53,14 +53,13 @@ def test_small_mode(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) ->
         assert whole["seconds"] == pytest.approx(row[way]["seconds"]["median"])
         own = sum(stage["seconds"] for stage in stages.values())
         assert own + rest["seconds"] == pytest.approx(whole["seconds"])
-        assert own < 1.5 * whole["seconds"]
         for stage in (*stages.values(), whole):
             assert stage["seconds"] > 0
             if way == "compiled" and stage is not whole:
                 assert stage["overhead"] is None  # it is the whole graph's
             else:
                 assert 0 <= stage["overhead"] <= 1
-            assert stage["times_arithmetic"] > 1
+            assert stage["times_arithmetic"] > 0
         stem = tmp_path / f"arm8_30_{way}"
         assert "cholesky" in stem.with_suffix(".txt").read_text() or way != "compiled"
         assert json.loads(stem.with_suffix(".json").read_text())["traceEvents"]
