@@ -2,9 +2,13 @@
 
     python scripts/compare_versions.py --against v0.1 --data DATA --out compare_versions.json
 
-The other version, any commit of this repository, is checked out beside and runs with the packages
-of this environment. Each repeat tracks every clip with both, one after the other, in processes of
-one thread; ratios are taken within a repeat. The clips:
+The other version, any commit of this repository, runs in an environment of its own: its checkout,
+packages as its `constraints.txt` has them, and its kernels lie in a folder of `--environments`
+named after the commit. The first run installs them with pip, whose settings hold (`PIP_FIND_LINKS`
+for a torch for the CPU), later runs find them. `--same-environment` runs it with the packages of
+this environment instead and needs no network. The report's `note` has the versions of both. Each
+repeat tracks every clip with both, one after the other, in processes of one thread; ratios are
+taken within a repeat. The clips:
 
 | clip | what |
 |---|---|
@@ -23,12 +27,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -38,6 +41,8 @@ from common import REPOSITORY, Table, finish, peak_mib, start
 from matplotlib.figure import Figure
 
 from torchcss.errors import ConfigurationError
+from torchcss.files import prepare_output_folder
+from torchcss.kernels.pipeline import cache_folders
 from torchcss.show.style import save_figure
 from torchcss.studies.demo import CLIP
 
@@ -50,6 +55,18 @@ except ModuleNotFoundError:
 sys.exit(main())
 """
 """Runs the command line of any version."""
+LOOK = """
+import platform
+from importlib import metadata, util
+found = ["Python " + platform.python_version()]
+for name in ("torch", "numpy", "numba"):
+    try:
+        found.append(name + " " + metadata.version(name))
+    except metadata.PackageNotFoundError:
+        found.append("no " + name)
+print(util.find_spec("torchcss").origin, ", ".join(found), sep="\\n")
+"""
+"""Tells which package is imported, and the versions beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +81,10 @@ class Config:
     """Frames of each clip."""
     repeats: int = 3
     """Repeats."""
+    environments: Path = next(cache_folders()).parent / "environments"
+    """Folder of the other versions and their environments; it may be deleted."""
+    same_environment: bool = False
+    """Run the other version with the packages of this environment."""
     two: bool = False
     """Measure this version with two threads, too."""
     samples: tuple[int, ...] = ()
@@ -82,24 +103,78 @@ class Measured(NamedTuple):
     memory_mib: float
 
 
-@contextmanager
-def checked_out(revision: str) -> Iterator[Path]:
-    """A folder with another version.
+class Version(NamedTuple):
+    """A version as it is run.
+
+    Attributes:
+        source: Its checkout.
+        python: The interpreter of its environment.
+        kernels: Variable that names its cache of kernels; empty: that of this environment.
+    """
+
+    source: Path
+    python: str
+    kernels: dict[str, str]
+
+    def variables(self) -> dict[str, str]:
+        """Variables of its processes, which have one thread."""
+        own = {"PYTHONPATH": str(self.source), "OMP_NUM_THREADS": "1"}
+        return {**os.environ, **own, **self.kernels}
+
+
+def other_version(config: Config) -> Version:
+    """The other version, with an environment of its own or with this one.
 
     Raises:
-        ConfigurationError: If there is no such version.
+        ConfigurationError: If there is no such version, or its packages cannot be installed.
+        OutputError: If its folder cannot be made.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / "other"
-        git = ["git", "-C", str(REPOSITORY), "worktree"]
-        words = [*git, "add", "--detach", "--quiet", str(place), revision]
-        done = subprocess.run(words, capture_output=True, text=True)
-        if done.returncode:
-            raise ConfigurationError(f"--against {revision}: {done.stderr.strip()}")
-        try:
-            yield place
-        finally:
-            subprocess.run([*git, "remove", "--force", str(place)], check=True)
+    git, told = ["git", "-C", str(REPOSITORY)], f"--against {config.against}"
+    name = f"{config.against}^{{commit}}"
+    commit = said([*git, "rev-parse", "--verify", name], told).strip()
+    place = config.environments.resolve() / commit
+    source, packed = place / "source", place / "source.zip"
+    prepare_output_folder(place)
+    said([*git, "archive", "--output", str(packed), commit], told)
+    shutil.unpack_archive(packed, source)
+    if config.same_environment:
+        return Version(source, sys.executable, {})
+    python, installed = place / "environment" / "bin" / "python", place / "installed"
+    if not installed.exists():  # or not to the end
+        print(f"installing {config.against} in {place}, once (minutes)", file=sys.stderr)
+        # -I: what PYTHONPATH and the folder here have is not taken for what is installed there.
+        said([sys.executable, "-I", "-m", "venv", "--clear", str(place / "environment")], told)
+        pip = [str(python), "-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        said([*pip, "-c", str(source / "constraints.txt"), "-e", str(source)], told)
+        installed.touch()
+    return Version(source, str(python), {"TORCHCSS_CACHE": str(place)})
+
+
+def said(words: list[str], told: str, variables: dict[str, str] | None = None) -> str:
+    """What a command printed.
+
+    Raises:
+        ConfigurationError: If it failed, with what was asked for (`told`) and its last lines.
+    """
+    done = subprocess.run(words, capture_output=True, text=True, env=variables)
+    if done.returncode:
+        lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
+        raise ConfigurationError("\n".join([f"{told}: {' '.join(words)}", *lines[-8:]]))
+    return done.stdout
+
+
+def packages(version: Version) -> str:
+    """Versions of Python, torch, numpy and numba that a version runs with.
+
+    Raises:
+        ConfigurationError: If it is another package that is imported.
+    """
+    words, told = [version.python, "-P", "-c", LOOK], str(version.source)
+    file, found = said(words, told, version.variables()).splitlines()
+    print(f"{file}: {found}")
+    if not Path(file).resolve().is_relative_to(version.source.resolve()):
+        raise ConfigurationError(f"{version.source}: expected its package, got {file}")
+    return found
 
 
 def clips(config: Config) -> dict[str, list[str]]:
@@ -124,43 +199,42 @@ def clips(config: Config) -> dict[str, list[str]]:
     return found
 
 
-def track(version: Path, words: list[str]) -> Measured:
+def track(version: Version, words: list[str]) -> Measured:
     """Track a clip with a version, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-c", ENTRY, "track", *words, "--out", folder]
-        environment = {**os.environ, "PYTHONPATH": str(version), "OMP_NUM_THREADS": "1"}
+        command = [version.python, "-c", ENTRY, "track", *words, "--out", folder]
+        variables = version.variables()
         log = Path(folder) / "log"
-        with log.open("w") as said:
+        with log.open("w") as printed:
             began = time.perf_counter()
             process = subprocess.Popen(
-                command, env=environment, cwd=folder, stdout=said, stderr=subprocess.STDOUT
+                command, env=variables, cwd=folder, stdout=printed, stderr=subprocess.STDOUT
             )
             _, status, usage = os.wait4(process.pid, 0)
             seconds = time.perf_counter() - began
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
-            raise ConfigurationError(f"{version}: {log.read_text(errors='replace')[-2000:]}")
+            raise ConfigurationError(f"{version.source}: {log.read_text(errors='replace')[-2000:]}")
         summary = json.loads((Path(folder) / "summary.json").read_text())
     return Measured(summary["seconds_per_frame"], seconds, peak_mib(usage.ru_maxrss))
 
 
 def main(config: Config) -> dict[str, Any]:
     """Measure, print, write; return what is written."""
-    with checked_out(config.against) as other:
-        ways: dict[str, tuple[Path, list[str]]] = {
-            "other": (other, []), "this": (REPOSITORY, ["--threads", "1"]),
-        }  # fmt: skip
-        if config.two:
-            ways["two threads"] = REPOSITORY, ["--threads", "2"]
-        runs: dict[str, dict[str, list[Measured]]] = {}
-        for repeat in range(config.repeats + 1):
-            for clip, words in clips(config).items():
-                for way, (version, more) in ways.items():
-                    if repeat == 0 and way != "this":
-                        continue  # only to have the kernels in the cache
-                    found = track(version, [*words, *more])
-                    if repeat:
-                        runs.setdefault(clip, {}).setdefault(way, []).append(found)
+    other, this = other_version(config), Version(REPOSITORY, sys.executable, {})
+    note = f"{config.against}: {packages(other)}; this version: {packages(this)}"
+    ways = {"other": (other, []), "this": (this, ["--threads", "1"])}
+    if config.two:
+        ways["two threads"] = this, ["--threads", "2"]
+    runs: dict[str, dict[str, list[Measured]]] = {}
+    for repeat in range(config.repeats + 1):
+        for clip, words in clips(config).items():
+            for way, (version, more) in ways.items():
+                if repeat == 0 and way == "two threads":
+                    continue  # only to have the kernels of both versions in their caches
+                found = track(version, [*words, *more])
+                if repeat:
+                    runs.setdefault(clip, {}).setdefault(way, []).append(found)
     rows, cells = {}, []
     for clip, by_way in runs.items():
         for way, measured in by_way.items():
@@ -184,7 +258,7 @@ def main(config: Config) -> dict[str, Any]:
     table = Table(f"`torchcss track`, {config.frames} frames", columns, cells)
     if config.plot is not None:
         save_figure(seconds_figure(config, rows), config.plot)
-    report = {"frames": config.frames, "repeats": config.repeats, "rows": rows}
+    report = {"note": note, "frames": config.frames, "repeats": config.repeats, "rows": rows}
     return finish(config.out, report, table)
 
 
