@@ -46,7 +46,6 @@ ROWS: dict[str, dict[str, Any]] = {
     "without halving": {"preset": "css, all descend"},
     "with background": {"with": "background"},
     "with silhouette": {"with": "silhouette"},
-    "without recovery": {"recovery": False},
     "likelihood power 0.2": {"likelihood_power": 0.2},
     "likelihood power 1": {"likelihood_power": 1.0},
 }

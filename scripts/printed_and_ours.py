@@ -3,9 +3,9 @@
     python scripts/printed_and_ours.py --sequences ARM DARK --out docs/results/exchange.json
 
 `ijrr_css` and `css` differ in their cost (terms, weights, edges, where keypoints count), in their
-search (samples, descents, what is kept, recovery, flips, limits, where they start from) and in
-their dynamics. From either end one of the three is taken from the other tracker, so that one sees
-which of our deviations from the paper earn their place. All start from the same first pose and see
+search (samples, descents, what is kept, flips, limits, where they start from) and in their
+dynamics. From either end one of the three is taken from the other tracker, so that one sees which
+of our deviations from the paper earn their place. All start from the same first pose and see
 keypoints in the first frame alone.
 """
 
@@ -70,7 +70,6 @@ def with_search(plan: Plan, other: Plan) -> Plan:
             tracker=other.tracker,
             bounds=other.bounds,
             one_fit=other.one_fit,
-            recovery=other.recovery,
             jumps_every=other.jumps_every,
             limb_jumps=other.limb_jumps,
         ),

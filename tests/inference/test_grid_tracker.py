@@ -13,7 +13,6 @@ from torchcss.inference.mixture import GaussianMixture
 from torchcss.inference.problem import SearchProblem
 from torchcss.inference.proposals import EigenDirectionGrid
 from torchcss.linalg import LEAST_CURVATURE
-from torchcss.tracking.recovery import Recovery
 from torchcss.types import LocalModel, Status
 
 BOUNDS = problems.box(2, -6, 6)
@@ -160,9 +159,6 @@ def test_floored_hessians_are_counted():
     torch.testing.assert_close(state.mixture.covariance[0].diagonal(), expected)
 
 
-def test_bad_numbers_and_widening():
+def test_bad_numbers():
     with pytest.raises(ConfigurationError, match=r"GridTracker.num_modes"):
         replace(ARM, num_modes=0)
-    wide = Recovery(samples=3, modes=2).widened(ARM)
-    assert isinstance(wide, GridTracker)
-    assert (wide.num_modes, wide.num_samples) == (6, 27)

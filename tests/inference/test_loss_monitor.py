@@ -8,18 +8,9 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pytest
-import torch
 
 from torchcss.errors import ConfigurationError
-from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.loss_monitor import LossMonitor, MonitorState
-from torchcss.inference.mixture import GaussianMixture
-from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
-from torchcss.inference.proposals import ScaledProposal
-from torchcss.inference.tracker import Tracker
-from torchcss.tracking.presets import PRESETS
-from torchcss.tracking.recovery import Recovery
-from torchcss.tracking.settings import Settings, make_tracker
 
 MONITOR = LossMonitor()
 
@@ -155,33 +146,3 @@ def test_a_window_holds_what_is_learnt_before_anything_is_judged():
     with pytest.raises(ConfigurationError, match=r"LossMonitor\.burn_in: .* the window"):
         LossMonitor(window=5)
     assert LossMonitor(burn_in=5, window=5).burn_in == 5
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_tracker_of_the_table_searches_more_widely(preset: str, generator: torch.Generator):
-    narrow = make_tracker(Settings(preset=preset, body="arm8", samples=10, modes=2), motion=0.1)
-    wide = Recovery(samples=3, modes=2, scale=2.0).widened(narrow)
-    assert type(wide) is type(narrow)
-    assert wide.num_samples == 30
-    assert narrow.num_samples == 10
-    if isinstance(narrow, (ParticleFilter, AnnealedParticleFilter)):
-        assert wide.num_modes == 2
-    elif isinstance(narrow, GridTracker):
-        assert wide.num_modes == 4
-    else:
-        assert isinstance(narrow, Tracker)
-        assert isinstance(wide, Tracker)
-        assert wide.num_modes == 4
-        assert wide.forgetting == 0
-        assert not wide.soft_matching
-        assert wide.dynamics == narrow.dynamics
-        before, after = narrow.proposal, wide.proposal
-        if isinstance(before, ScaledProposal):
-            assert isinstance(after, ScaledProposal)
-            assert before.covariance_scale is not None
-            assert after.covariance_scale == 2 * before.covariance_scale
-        else:
-            assert after == before
-    # It goes on from a state of the narrow one.
-    mixture = GaussianMixture(torch.zeros(1, 2), torch.eye(2)[None], torch.zeros(1))
-    assert len(wide.init(mixture, generator=generator).mixture.mean) == 1

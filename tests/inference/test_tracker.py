@@ -288,9 +288,6 @@ def test_bad_input(generator):
         for number in (-1, torch.nan, torch.inf):
             with pytest.raises(ConfigurationError, match=rf"Tracker\.{name}: expected at least 0"):
                 replace(CSS, **{name: number})
-    for number in (-0.1, 1.1, torch.nan):
-        with pytest.raises(ConfigurationError, match=r"Tracker\.forgetting: expected 0 to 1, got"):
-            replace(CSS, forgetting=number)
     with pytest.raises(ConfigurationError, match="num_samples"):
         Tracker(proposal=CSS.proposal, num_samples=0, num_modes=1)
     with pytest.raises(ShapeError, match=r"mixture.covariance.*\[..., 1, 2, 2\]"):
@@ -457,14 +454,14 @@ def test_soft_matching_hands_no_past_to_who_is_far_from_it(generator):
 
 
 @pytest.mark.parametrize("soft_matching", [False, True])
-def test_where_all_is_forgotten_an_empty_place_is_nobodys_parent(soft_matching, generator):
+def test_an_empty_place_is_nobodys_parent(soft_matching, generator):
     well = problems.DoubleWell()
     before = GaussianMixture(
         well.minima[[0, 0]],
         0.01 * torch.eye(2).double().expand(2, 2, 2),
         torch.tensor([-torch.inf, 0.0]).double(),
     )
-    tracker = replace(CSS, forgetting=0.0, soft_matching=soft_matching, num_modes=1)
+    tracker = replace(CSS, soft_matching=soft_matching, num_modes=1)
     start = tracker.init(before, generator=generator)
     start = start._replace(mixture=before)
     _, info = tracker.step(start, SearchProblem(well), BOUNDS)

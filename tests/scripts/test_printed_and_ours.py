@@ -33,7 +33,6 @@ def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
     assert cost.tracker == ours.tracker
     search = plans["ours, printed search"]
     assert search.choice == ours.choice
-    assert search.recovery is None
     assert search.one_fit
     assert search.tracker.proposal == printed.tracker.proposal
     assert search.tracker.dynamics == ours.tracker.dynamics

@@ -28,7 +28,7 @@ CHANGED: dict[str, Any] = {
     "curvature": "gauss-newton", "working_size": 160, "contour_weight": 120.0,
     "weights": {"region": 0.5}, "boundary_emphasis": 0.2, "potential": "leclerc", "seed": 3,
     "device": "cpu:0", "dtype": "float32", "engine": "eager", "engine_dtype": "float32",
-    "threads": 2, "overlay": False, "recovery": False, "stature": 1.6, "ground": -1.2,
+    "threads": 2, "overlay": False, "stature": 1.6, "ground": -1.2,
 }  # fmt: skip
 """Another value than the default for every setting."""
 
@@ -93,7 +93,7 @@ def options(settings: Mapping[str, Any]) -> list[str]:
     words: list[str] = []
     for name, value in settings.items():
         flag = name.replace("_", "-")
-        if isinstance(value, bool) and name != "recovery":
+        if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
         elif isinstance(value, tuple):
             words += [f"--{flag}", *value]

@@ -111,14 +111,13 @@ def test_a_page_of_a_folder_that_is_moved(folder: Path, tmp_path: Path) -> None:
 
 
 def test_the_page_says_which_tracker_it_was(folder: Path) -> None:
-    settings = {"preset": "ijrr_css", "recovery": None, "keypoints_use": None}
+    settings = {"preset": "ijrr_css", "keypoints_use": None}
     summary = {"settings": settings, "samples": 40, "modes": 3}
     told = facts_of(folder, {**summary, "changed_beside_preset": ["samples"]})
     assert told["Preset"].startswith("ijrr_css: covariance scaled sampling as printed")
     assert told["Preset"].endswith(
         "at most 40 samples a frame and 3 modes; changed beside it: samples"
     )
-    assert told["Told lost"] == "not watched for, without recovery"
     assert told["Keypoints"].endswith("joints.npz, in the first frame alone")
     ours = facts_of(
         folder,

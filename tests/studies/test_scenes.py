@@ -77,7 +77,7 @@ def costs_of_a_tracker_at_the_truth(settings: Settings, num_frames: int) -> list
         view,
         variance=1.0,
     )
-    session.plan = session.plan._replace(tracker=spy, jumps_every=0, recovery=None)  # type: ignore[arg-type]
+    session.plan = session.plan._replace(tracker=spy, jumps_every=0)  # type: ignore[arg-type]
     # Scenes are looked at everywhere.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TrackingSession, "_windows", lambda self, *_: (None,))

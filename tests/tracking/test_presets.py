@@ -115,7 +115,7 @@ def test_weights_of_css_and_of_figure_6():
     for name in ("arm8", "body34"):
         printed = make_tracker(Settings(preset="ijrr_css", body=name))
         assert isinstance(printed, Tracker)
-        assert (printed.likelihood_power, printed.forgetting) == (1.0, 1.0)
+        assert printed.likelihood_power == 1.0
         assert not printed.soft_matching
 
 
@@ -170,7 +170,6 @@ def test_nothing_of_ours_is_in_the_papers_rows(name, body):
     settings, row = Settings(preset=name, body=body), PRESETS[name]
     assert not settings.changed()
     assert settings.keypoints_first_only
-    assert not settings.recovers
     assert row.start == "one fit"
     assert row.jumps_every == 0
     assert row.persistence == (1.0 if "cham_rehg" in name else 0.0)
@@ -222,7 +221,7 @@ def test_figure_6_draws_from_scaled_covariances_and_nothing_else(name):
     assert (proposal.stratified, proposal.correlated_projection) == (False, False)
     assert not proposal.include_modes
     assert tracker.dynamics.deviation == 0
-    assert (tracker.forgetting, tracker.likelihood_power) == (1, 1)
+    assert tracker.likelihood_power == 1
     assert not tracker.keep_alike
     assert (tracker.separation, tracker.oversampling) == (0.03, 1)
     assert PRESETS[name].optimiser == PRESETS["ijrr_css"].optimiser
@@ -247,7 +246,7 @@ def test_condensation_is_inflated_in_posterior_and_dynamics():
     tracker = make_tracker(Settings(preset="condensation_inflated", body="body34"), motion=0.1)
     assert isinstance(tracker, ParticleFilter)
     assert (tracker.dilution, tracker.noise_scale) == (1 / 8, 8.0)
-    assert (row.noise, row.terms, row.recovery) == (1.0, "papers", False)
+    assert (row.noise, row.terms) == (1.0, "papers")
 
 
 @pytest.mark.parametrize(
@@ -284,14 +283,11 @@ def test_which_rows_have_physical_constraints():
 
 
 def test_what_is_given_beside_a_preset_wins_and_is_recorded():
-    settings = Settings(
-        preset="ijrr_css", terms=("default",), keypoints_use="all", recovery=True, samples=9
-    )
-    assert set(settings.changed()) == {"terms", "keypoints_use", "recovery", "samples"}
+    settings = Settings(preset="ijrr_css", terms=("default",), keypoints_use="all", samples=9)
+    assert set(settings.changed()) == {"terms", "keypoints_use", "samples"}
     assert "region" in settings.used_terms
-    assert settings.recovers
     assert not settings.keypoints_first_only
-    assert not Settings(recovery=True, keypoints_use="all", terms=("default",)).changed()
+    assert not Settings(keypoints_use="all", terms=("default",)).changed()
     repelling = Settings(preset="ijrr_gaussian_single", terms=("papers",))
     assert repelling.changed() == ("terms",)
     assert "interpenetration" in repelling.used_terms
@@ -328,12 +324,11 @@ def test_old_names_and_old_runs_still_open():
     old = {"preset": "css_figure_6", "terms": ["contour", "region"], "recovery": True}
     opened = settings_from_plain(old)
     assert (opened.preset, opened.used_terms) == ("ijrr_css", ("contour", "region"))
-    assert opened.recovers
 
 
 def test_css_has_what_was_measured_to_help():
     plain = Settings()
-    assert (plain.recovers, plain.keypoints_first_only, plain.used_terms) == (True, False, TERMS)
+    assert (plain.keypoints_first_only, plain.used_terms) == (False, TERMS)
     tracker = make_tracker(Settings(preset="css", body="arm8"), motion=0.1)
     assert isinstance(tracker, Tracker)
     optimiser = tracker.optimiser
@@ -345,7 +340,7 @@ def test_css_has_what_was_measured_to_help():
     assert (body.num_samples, body.survivors, body.num_modes) == (60, 15, 7)
     assert (tracker.coarse_every, tracker.keep_alike, tracker.converged_only) == (3, True, True)
     assert tracker.dynamics == ConstantVelocity(deviation=0.1, persistence=0.8)
-    assert (tracker.separation, tracker.forgetting) == (0.12, 1.0)
+    assert tracker.separation == 0.12
     contour, flow = (make_choice(plain, 2.0).find(kind) for kind in (ContourTerm, FlowTerm))
     assert contour.fitted_level == pytest.approx(0.983, abs=1e-3)
     assert (flow.fitted_level, flow.occlusion_factor) == (0.7, 1.1)

@@ -284,15 +284,15 @@ def test_settings_out_of_range_are_refused_by_name(name: str, bad: tuple, good: 
 
 def test_settings_of_other_types_are_those_of_a_file(tmp_path: Path):
     given = {"samples": np.int64(6), "likelihood_power": np.float32(0.25), "seed": np.int64(3)}
-    more = {"recovery": np.bool_(False), "weights": {"flow": np.float32(2)}, "terms": "still"}
+    more = {"overlay": np.bool_(False), "weights": {"flow": np.float32(2)}, "terms": "still"}
     others = {"body": Path("arm8"), "device": torch.device("cpu")}
     made = Settings(**given, **more, **others)
     track = Track.empty((), ())._replace(settings=asdict(made))
     tracks.save_track(tmp_path / "track.npz", track)
     held = tracks.load_track(tmp_path / "track.npz").settings
     assert settings_from_plain(held) == made
-    assert {name: type(held[name]) for name in ("samples", "likelihood_power", "recovery")} == {
-        "samples": int, "likelihood_power": float, "recovery": bool,
+    assert {name: type(held[name]) for name in ("samples", "likelihood_power", "overlay")} == {
+        "samples": int, "likelihood_power": float, "overlay": bool,
     }  # fmt: skip
     torch.Generator().manual_seed(made.seed)
     selection = FrameSelection(start=np.int64(1), stop=np.int64(3))
@@ -486,7 +486,7 @@ def track(
     masks: list[np.ndarray] | None = None,
 ) -> list[Posterior]:
     """Track from the true first pose, by default without keypoints, with few samples."""
-    few = replace(settings, samples=4, modes=2, recovery=False)
+    few = replace(settings, samples=4, modes=2)
     view = view or seen_by(sequence.camera)
     session = session_at(few, sequence.body, sequence.states[0], view)
     session.plan = session.plan._replace(jumps_every=0)

@@ -63,7 +63,6 @@ def follow(
     start = sequence.states[:1] + 0.1
     settings = Settings(
         body="arm8", terms=("joints", "stabiliser"), working_size=640, samples=6, modes=2,
-        recovery=False,
     )  # fmt: skip
     session = session_at(settings, sequence.body, start, *views)
     moments = zip_longest(images, *(beside for _, beside in others))

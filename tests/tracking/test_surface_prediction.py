@@ -370,7 +370,7 @@ def test_the_plan_of_a_session_says_whether_surfaces_predict(
     monkeypatch.setattr(
         SurfaceMotion, "__call__", lambda *_, expected, **__: asked.append(expected) or expected
     )
-    settings = Settings(terms=("contour",), samples=2, modes=1, recovery=False, working_size=160)
+    settings = Settings(terms=("contour",), samples=2, modes=1, working_size=160)
     body, x, view = the_body(), poses(), seen_by(the_camera())
     image = (255 * picture(x[0])).byte()[..., None].expand(-1, -1, 3).numpy()
     for planned in (True, False):
@@ -399,7 +399,6 @@ def tracked(prediction: Literal["velocity", "surface"]) -> list[Posterior]:
         seed=0,
         samples=4,
         modes=2,
-        recovery=False,
     )
     body, x = the_body(), poses()
     images = [picture(turned(x, 8.0 * t)[0]) for t in range(3)]

@@ -363,7 +363,7 @@ class _Totals:
             "iterations_per_sample": self.iterations / max(self.samples, 1),
             "distinct_modes_per_frame": self.distinct / num_frames,
             "events": self.events,
-            "frames_searched_widely": self.lost,
+            "frames_told_lost": self.lost,
             "covariances_floored": self.floored,
             "optimiser_status": {s.name.lower(): int(self.statuses[s]) for s in Status},
             "best_mode_cost_by_term": {k: v / num_frames for k, v in self.terms.items()},

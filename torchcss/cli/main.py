@@ -92,7 +92,6 @@ _OLD_NAMES = {
     "--focal-px": "--focal",
     "--field-of-view": "--fov",
     "--agility": "--acceleration-ratio",
-    "--no-recovery": "--recovery=False",
     "--no-colours": "--colours=False",
 }
 """Options of version 0.1 that are written otherwise now; not in the help."""

@@ -10,7 +10,7 @@ Biometrika 41, 1954):
 so that one bad frame is no loss, and several are. Only terms that the frame has are compared, each
 with its own past. While the sum is above half the threshold nothing is learnt.
 
-What is done then is `torchcss.tracking.recovery`.
+Nothing is done then but to say so: a wider search did not find more bodies again (`docs/tried.md`).
 """
 
 from __future__ import annotations

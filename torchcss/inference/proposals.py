@@ -38,7 +38,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -337,12 +337,6 @@ class ScaledProposal(_RandomProposal):
                 "the two"
             )
         return given[0] if self.covariance_scale is None else math.sqrt(given[0])
-
-    def widened(self, scale: float) -> Self:
-        """The same with its factor on the covariance so many times as large."""
-        if self.covariance_scale is not None:
-            return replace(self, covariance_scale=scale * self.covariance_scale)
-        return replace(self, deviation_scale=math.sqrt(scale) * self._factor)
 
 
 @frozen

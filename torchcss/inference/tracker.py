@@ -308,8 +308,6 @@ class Tracker(SequenceTracker):
         num_modes: Modes kept, `K`; the papers use 3 for an arm and 7 for a body.
         optimiser: How samples descend.
         dynamics: What happens between frames; the papers' driftless diffusion by default.
-        forgetting: Power of the prior's weights in step 5. One is Fig. 6; below one, old evidence
-            is forgotten by degrees.
         likelihood_power: Power of a frame's likelihood in the weights, step 3, and in the
             covariances that are stated. One is Fig. 6, which takes frames as independent evidence.
             They are not: what a body model lacks, clutter and occlusion cost the same modes in
@@ -348,7 +346,6 @@ class Tracker(SequenceTracker):
     proposal: Proposal
     optimiser: TrustRegionNewton = field(default_factory=TrustRegionNewton)
     dynamics: Dynamics = field(default_factory=Diffusion)
-    forgetting: float = 1.0
     likelihood_power: float = 1.0
     coarse_every: int = 3
     oversampling: int = 1
@@ -365,7 +362,6 @@ class Tracker(SequenceTracker):
         check_positive(self, "surprise")
         check_range(self, "oversampling", least=1)
         check_range(self, "coarse_every", "survivors", "separation")
-        check_range(self, "forgetting", most=1)
         check_positive(self, "likelihood_power", finite=True)
 
     @property
@@ -543,19 +539,15 @@ class Tracker(SequenceTracker):
         told = torch.zeros_like(cost) if problem.past is None else problem.past.value(modes.mean)
         log_weight = -self.likelihood_power * cost
         unpruned = GaussianMixture(modes.mean, modes.covariance, log_weight).normalise()
-        weight = prior.mixture.normalise().log_weight
-        # An empty place stays one, also where all is forgotten.
-        remembered = torch.where(weight > -torch.inf, self.forgetting * weight, -torch.inf)
-        tempered = prior.mixture._replace(log_weight=remembered)
-        past = None
+        before, past = prior.mixture.normalise(), None
         # It takes the place of what the cost says of the past, which else would count twice.
         if self.soft_matching:
-            past = prior_at(unpruned, tempered, self.surprise)
+            past = prior_at(unpruned, before, self.surprise)
             past = past._replace(log_weight=past.log_weight + self.likelihood_power * told)
         kept = self._explanations(problem, unpruned, -cost, past)
         pruned = unpruned.take(kept).normalise()
         if past is None:
-            past = match_to_prior(pruned, tempered)
+            past = match_to_prior(pruned, before)
             past = past._replace(log_weight=past.log_weight + self.likelihood_power * told[kept])
         else:
             past = Past(*(part[kept] for part in past))

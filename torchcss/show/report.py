@@ -292,9 +292,7 @@ def _keypoints(run: Run) -> str:
 
 
 def _losses(run: Run) -> str:
-    """How often the track was told lost, if somebody watched."""
-    if _option(run, "recovery") is False:
-        return "not watched for, without recovery"
+    """How often the track was told lost."""
     lost = sum(event["event"] == "lost" for event in run.summary.get("events", ()))
     return f"{lost} time{'' if lost == 1 else 's'}"
 

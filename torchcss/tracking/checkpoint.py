@@ -38,7 +38,7 @@ def state_tensors(state: SessionState) -> dict[str, Tensor]:
     Args:
         state: What `TrackingSession.checkpoint` returned.
     """
-    tensors: dict[str, Tensor] = {"num_lost": torch.tensor(state.num_lost)}
+    tensors: dict[str, Tensor] = {}
     _put(tensors, "tracker", state.tracker)
     tensors |= {f"body.{name}": value for name, value in state.body.state_dict().items()}
     for index, (seen, memory) in enumerate(zip(state.seen, state.memory, strict=True)):
@@ -53,12 +53,11 @@ def state_tensors(state: SessionState) -> dict[str, Tensor]:
             if window is not None:
                 tensors[f"windows.{index}.{number}"] = torch.tensor(window)
     tensors["times"] = torch.tensor(state.times, dtype=torch.float64)
-    if state.monitor is not None:
-        history, excess, total, score = state.monitor
-        for name, costs in history.items():
-            tensors[f"monitor.history.{name}"] = torch.tensor(costs, dtype=torch.float64)
-        tensors["monitor.excess"] = torch.tensor(excess, dtype=torch.float64)
-        tensors["monitor.sums"] = torch.tensor([total, score], dtype=torch.float64)
+    history, excess, total, score = state.monitor
+    for name, costs in history.items():
+        tensors[f"monitor.history.{name}"] = torch.tensor(costs, dtype=torch.float64)
+    tensors["monitor.excess"] = torch.tensor(excess, dtype=torch.float64)
+    tensors["monitor.sums"] = torch.tensor([total, score], dtype=torch.float64)
     return {name: tensor.detach().cpu() for name, tensor in tensors.items()}
 
 
@@ -106,7 +105,6 @@ def state_from_tensors(tensors: Mapping[str, Tensor], body: BodyModel) -> Sessio
             seen=tuple(seen),
             memory=tuple(memory),
             monitor=_monitor(tensors),
-            num_lost=int(tensors["num_lost"]),
             windows=tuple(
                 tuple(_window(tensors, index, number) for number in range(len(seen)))
                 for index in range(2)
@@ -140,9 +138,7 @@ def _window(tensors: Mapping[str, Tensor], index: int, number: int) -> Window | 
     return None if corners is None else Window(*corners.tolist())
 
 
-def _monitor(tensors: Mapping[str, Tensor]) -> MonitorState | None:
-    if "monitor.sums" not in tensors:
-        return None
+def _monitor(tensors: Mapping[str, Tensor]) -> MonitorState:
     at = "monitor.history."
     history = {
         name.removeprefix(at): tuple(costs.tolist())

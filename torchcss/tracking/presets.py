@@ -1,7 +1,7 @@
 """The trackers by name, as one table of choices: the papers' and ours.
 
 `torchcss.tracking.settings.make_tracker` builds one. A row says everything: search, cost, dynamics,
-optimiser, recovery, what keypoints are used for and where the track starts. An option that the user
+optimiser, what keypoints are used for and where the track starts. An option that the user
 gives beside it wins (`Settings.changed`).
 
 | name | tracker | from |
@@ -28,11 +28,11 @@ degrees of freedom of the t, that modes of which no joint centre is 3 cm apart a
 minima, and `torchcss.linalg.LEAST_CURVATURE`. A filter gets as many evaluations of the cost as a
 descending tracker may take, 20 per sample that descends to the end.
 
-The papers' rows (decision "papers' presets") have the papers' terms (`Preset.terms`), no recovery,
-no flips, no descents on a coarser cost, driftless diffusion where that is printed, keypoints in the
-first frame alone, and they start from the covariance of one fit, which has the papers' priors
-(section 5 of both). Where several modes are kept nothing but what was drawn descends. Cham and
-Rehg's "ssd" row has Gaussian errors, Gauss-Newton Hessians, no joint limits and no repulsion;
+The papers' rows (decision "papers' presets") have the papers' terms (`Preset.terms`), no flips, no
+descents on a coarser cost, driftless diffusion where that is printed, keypoints in the first frame
+alone, and they start from the covariance of one fit, which has the papers' priors (section 5 of
+both). Where several modes are kept nothing but what was drawn descends. Cham and Rehg's "ssd" row
+has Gaussian errors, Gauss-Newton Hessians, no joint limits and no repulsion;
 [IJRR] names only the metric and the optimiser, the rest is our reading.
 """
 
@@ -108,7 +108,6 @@ class Preset:
         terms: Name of a set of terms, see `torchcss.tracking.settings.named_terms`.
         cost: Whose cost it is: "ours"; "ijrr" or "rr": as printed, see
             `torchcss.tracking.settings.make_choice`.
-        recovery: Whether a loss widens the search, see `torchcss.tracking.recovery`.
         keypoints_use: See `Settings`.
         start: Which fits of the first frame the track starts from: all, or the likeliest with its
             covariance (section 5 of both papers).
@@ -142,7 +141,6 @@ class Preset:
     capped: bool = True
     terms: str = "default"
     cost: Literal["ours", "ijrr", "rr"] = "ours"
-    recovery: bool = True
     keypoints_use: Literal["first", "all"] = "all"
     start: Literal["fits", "one fit"] = "fits"
 
@@ -209,7 +207,6 @@ def _printed(row: Preset, *, paper: Literal["ijrr", "rr"] = "ijrr") -> Preset:
         coarse_every=0,
         terms="papers",
         cost=paper,
-        recovery=False,
         keypoints_use="first",
         start="one fit",
     )

@@ -123,7 +123,7 @@ class Posterior(NamedTuple):
         seconds: Wall time of the frame by stage.
         term_seconds: Wall time of the search by what was evaluated; the rest of it is the
             optimiser's own.
-        lost: Whether the track counts as lost, see `torchcss.tracking.recovery`.
+        lost: Whether the track counts as lost, see `torchcss.inference.loss_monitor`.
         loss_score: By how many deviations the image costs more than before, see `LossMonitor`.
         others: The images of the other cameras; None from one that has ended.
     """
@@ -150,8 +150,7 @@ class SessionState(NamedTuple):
         body: The body on its present base.
         seen: What each camera saw last: the picture, and its contrast where that is wanted.
         memory: What each camera has taught.
-        monitor: What tells a loss; None where nothing does.
-        num_lost: Frames in a row that counted as lost, up to the last.
+        monitor: What tells a loss.
         windows: Where each view is looked at, in the next frame and in the one after it.
         times: Seconds at which the last two frames were shown, or as many as there were.
     """
@@ -160,8 +159,7 @@ class SessionState(NamedTuple):
     body: BodyModel
     seen: tuple[ViewObservation, ...]
     memory: tuple[Learnt, ...]
-    monitor: MonitorState | None
-    num_lost: int = 0
+    monitor: MonitorState
     windows: tuple[ViewWindows, ...] = ()
     times: tuple[float, ...] = ()
 
@@ -208,7 +206,7 @@ class TrackingSession:
             body=first.body,
             seen=(NOTHING_SEEN,) * nothing,
             memory=(NOTHING_KNOWN,) * nothing,
-            monitor=None if self.plan.recovery is None else self.plan.recovery.monitor.init(),
+            monitor=self.plan.monitor.init(),
             windows=(self._windows(first.body, mixture),) * 2,
         )
         self._expect(self.state)
@@ -414,18 +412,15 @@ class TrackingSession:
         term_seconds, modes = dict(stopwatch.seconds), after.mixture
         terms = self._terms_of_best(cost.of_children(info.origin[:1], info.prior), modes)
         monitor, lost = self._judged(terms, observation)
-        windows: ViewWindows = (None,) * len(self._observers)
-        if not lost:
-            memory = tuple(
-                observer.costs.learn(known, seen.features, body, modes.mean, modes.log_weight)
-                for observer, known, seen in self._of_views(memory, observation)
-            )
-            windows = self._windows(body, modes)
+        memory = tuple(
+            observer.costs.learn(known, seen.features, body, modes.mean, modes.log_weight)
+            for observer, known, seen in self._of_views(memory, observation)
+        )
+        windows = self._windows(body, modes)
         self._ahead.append(windows)
         next_body, moved = follow_with_base(body, after.per_interval(intervals))
         self.state = SessionState(
             *(moved, next_body, observation.views, memory, monitor),
-            num_lost=before.num_lost + 1 if lost else 0,
             windows=(*before.windows[1:], windows),
             times=(*before.times, observation.frame.time_s)[-2:],
         )
@@ -443,7 +438,7 @@ class TrackingSession:
             },
             term_seconds=term_seconds,
             lost=lost,
-            loss_score=0.0 if monitor is None else monitor.score,
+            loss_score=monitor.score,
             others=tuple(view.frame for view in observation.views[1:]),
         )
 
@@ -454,14 +449,12 @@ class TrackingSession:
 
     def _judged(
         self, terms: dict[str, float], observation: Observation
-    ) -> tuple[MonitorState | None, bool]:
+    ) -> tuple[MonitorState, bool]:
         """What tells a loss after a frame, and whether it tells one."""
-        recovery, monitor = self.plan.recovery, self.state.monitor
-        if recovery is None or monitor is None:
-            return monitor, False
         watched = {term.name for term in self.plan.choice.terms if term.watched}
         per_view = _per_view(terms, observation).items()
-        return recovery.monitor.update(monitor, {n: cost for n, cost in per_view if n in watched})
+        costs = {name: cost for name, cost in per_view if name in watched}
+        return self.plan.monitor.update(self.state.monitor, costs)
 
     def _of_views(
         self, memory: Sequence[Learnt], observation: Observation
@@ -495,28 +488,22 @@ class TrackingSession:
     def _tracker(
         self, observation: Observation, cost: TrackingCost, intervals: float
     ) -> SequenceTracker:
-        """The tracker of a frame: wider after a loss, with the moves and dynamics that it asks for.
+        """The tracker of a frame, with the moves and dynamics that it asks for.
 
         Particle filters have neither: they search by the noise of their own dynamics. Nor has a
         `GridTracker`.
         """
         plan, state = self.plan, self.state
-        tracker, recovery = plan.tracker, plan.recovery
-        tracker = tracker if intervals == 1 else tracker.over(intervals)
-        lost = recovery is not None and 0 < state.num_lost <= recovery.patience
-        if recovery is not None and lost:
-            tracker = recovery.widened(tracker)
+        tracker = plan.tracker if intervals == 1 else plan.tracker.over(intervals)
         if not isinstance(tracker, Tracker):
             return tracker
         if plan.one_fit and int(state.tracker.frame) == 0:
             tracker = replace(tracker, proposal=_AS_FITTED)
         search, dynamics, num = tracker.proposal, tracker.dynamics, tracker.num_samples
         camera, moves = self._observers[0].view.camera, []
-        if lost or self._flips_now():
+        if self._flips_now():
             flips = Flips(search=search, body=state.body, camera=camera, num=_NUM_FLIPS)
-            if recovery is not None and lost:
-                flips = replace(flips, num=recovery.num_flips, log_odds=0.0)
-            moves.append((flips, num if lost else _NUM_FLIPS))
+            moves.append((flips, _NUM_FLIPS))
         if (missed := self._missed_keypoints(cost, search)) is not None:
             moves.append((missed, _NUM_FLIPS))
         if plan.limb_jumps:

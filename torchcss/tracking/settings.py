@@ -30,12 +30,12 @@ from torchcss.cost.total import Engine
 from torchcss.errors import ConfigurationError, check_device, check_range, make_whole
 from torchcss.inference.dynamics import ConstantVelocity, Deviation
 from torchcss.inference.grid_tracker import GridTracker
+from torchcss.inference.loss_monitor import LossMonitor
 from torchcss.inference.proposals import ChamRehg, Condensation, EigenDirectionGrid
 from torchcss.inference.tracker import SequenceTracker, Tracker
 from torchcss.initialise.view import CameraView
 from torchcss.robust import Leclerc, Lorentzian, Quadratic
 from torchcss.tracking.presets import PARTS_OF_A_PERSON, PRESETS, Preset, preset_name
-from torchcss.tracking.recovery import Recovery
 from torchcss.tracking.view import Observer
 from torchcss.types import Bounds, Curvature, frozen
 from torchcss.vision.edges import EdgeConfiguration
@@ -158,8 +158,6 @@ class Settings:
         threads: With two or more, compiled kernels share out the samples among so many, and the
             next frame's features are found while this one is searched. Nothing else changes.
         overlay: Write `overlay.mp4` and `report.html`.
-        recovery: Tell from the costs when the track is lost, and search more widely then; as the
-            preset does by default.
     """
 
     body: str = "body34"
@@ -188,7 +186,6 @@ class Settings:
     engine_dtype: Literal["float32", "float64"] | None = None
     threads: int = 1
     overlay: bool = True
-    recovery: bool | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "preset", preset_name(self.preset))
@@ -255,11 +252,6 @@ class Settings:
         """Whether keypoints count in the first frame alone."""
         return (self.keypoints_use or PRESETS[self.preset].keypoints_use) == "first"
 
-    @property
-    def recovers(self) -> bool:
-        """Whether a loss widens the search."""
-        return PRESETS[self.preset].recovery if self.recovery is None else self.recovery
-
     def changed(self) -> tuple[str, ...]:
         """Names of the options in which the run differs from its preset."""
         row = PRESETS[self.preset]
@@ -271,7 +263,6 @@ class Settings:
             "terms": set(self.used_terms) != set(_preset_terms(row)),
             "curvature": self.curvature not in (None, row.curvature.value),
             "weights": any(weight != 1 for weight in self.weights.values()),
-            "recovery": self.recovers != row.recovery,
         }
         return tuple(name for name, does in differs.items() if does)
 
@@ -540,7 +531,7 @@ class Plan(NamedTuple):
         one_fit: Whether the track starts from the likeliest fit of the first frame alone.
         keypoints_first_only: Whether keypoints count in the first frame alone.
         boundary_emphasis: Weight of motion boundaries, see `FrameFeatures.edge_field`.
-        recovery: How losses are told and what is done then; None: nothing.
+        monitor: Tells from the costs when the track is lost.
         jumps_every: Every how many frames the flips of the best mode join the search; 0: never, and
             no limb is put at keypoints that it misses.
         limb_jumps: How many other poses of an arm join the search; 0: none.
@@ -557,7 +548,7 @@ class Plan(NamedTuple):
     one_fit: bool
     keypoints_first_only: bool
     boundary_emphasis: float
-    recovery: Recovery | None
+    monitor: LossMonitor
     jumps_every: int
     limb_jumps: int
     surface_prediction: bool
@@ -608,7 +599,7 @@ def make_plan(settings: Settings, body: BodyModel, view: CameraView, frame_inter
         one_fit=row.start == "one fit",
         keypoints_first_only=settings.keypoints_first_only,
         boundary_emphasis=boundary_emphasis(settings),
-        recovery=Recovery() if settings.recovers else None,
+        monitor=LossMonitor(),
         jumps_every=row.jumps_every,
         limb_jumps=settings.limb_jumps,
         surface_prediction=settings.prediction == "surface",
