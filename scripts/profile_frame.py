@@ -30,7 +30,7 @@ from torchcss.app.track import track_video
 from torchcss.cli.options import SettingsOptions
 from torchcss.cost.frame import FrameCosts
 from torchcss.cost.fused.engine import FusedEngine
-from torchcss.inference import tracker
+from torchcss.inference import tracker, trust_region
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.kernels import checked
 from torchcss.tracking.flip_moves import Flips
@@ -44,7 +44,7 @@ STAGES: dict[str, tuple[Any, str]] = {
     "other features": (TrackingSession, "observe"),
     "preparing the terms": (TrackingSession, "_cost"),
     "evaluations": (FusedEngine, "local_model"),
-    "planning steps": (TrustRegionNewton, "_advance_compiled"),
+    "planning steps": (trust_region._Pool, "advance_compiled"),
     "covariances of modes": (TrustRegionNewton, "modes"),
     "flips of limbs": (Flips, "states"),
     "the rest of the search": (tracker.Tracker, "step"),
@@ -83,8 +83,8 @@ REASONS = {
         "somewhere, a tenth of a millisecond each."
     ),
     "flips of limbs": (
-        "In every third frame three times as much: 32 poses by 8 evaluations of torch's "
-        "operations, 0.7 ms each."
+        "In every third frame three times as much: 32 poses by 8 steps, 0.1 ms each and as much "
+        "for planning; lines of sight and combinations of limbs by torch's operations are the rest."
     ),
     "the rest of the search": (
         "Draws, weights and distances of modes: operations of torch on arrays of a few "

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from torchcss.body.load import load_body
+from torchcss.cost.fused.targets import FusedTargets
 from torchcss.cost.targets import ARM, PointTargets, pose_targets
 from torchcss.cost.term import differentiate_twice
-from torchcss.errors import BodyError, ShapeError
+from torchcss.errors import BodyError, ConfigurationError, ShapeError
+from torchcss.kernels import compiler
 from torchcss.solve.inverse_kinematics import link_pose
 
 
@@ -109,3 +112,49 @@ def test_bad_input_is_told() -> None:
         pose_targets(body, "tail", torch.eye(4))
     with pytest.raises(ShapeError, match=r"a frame \[4, 4\] or a place \[3\], got \[3, 3\]"):
         pose_targets(body, "r_wrist_link", torch.eye(3))
+
+
+def joints_of(name: str, generator: torch.Generator, *, sticky: bool) -> PointTargets:
+    """All joint centres of a body against places of their own for each of seven states."""
+    body = load_body(name)
+    target = body.pose(body.rest).joints
+    apart = torch.randn(7, *target.shape, generator=generator, dtype=target.dtype)
+    return PointTargets(
+        body=body,
+        link=body.marker_link,
+        offset=body.marker_offset,
+        target=target + 0.3 * apart,
+        sigma=0.01 + torch.rand(len(target), generator=generator, dtype=target.dtype),
+        sticky=sticky,
+    )
+
+
+@pytest.mark.skipif(not compiler.AVAILABLE, reason="numba is not installed")
+@pytest.mark.parametrize("sticky", [False, True])
+@pytest.mark.parametrize("name", ["arm7", "arm8", "body34"])
+def test_the_compiled_cost_is_the_same(name: str, sticky: bool, generator: torch.Generator) -> None:
+    cost = joints_of(name, generator, sticky=sticky)
+    compiled = cost.compiled()
+    assert isinstance(compiled, FusedTargets)
+    low, high = cost.body.bounds.lower.clamp(min=-3), cost.body.bounds.upper.clamp(max=3)
+    share = torch.rand(4, len(low), generator=generator, dtype=low.dtype)
+    x = torch.stack([low, high, torch.zeros_like(low), *(low + share * (high - low))])
+    items = torch.tensor([5, 0, 2])
+    for ours, theirs, at in (
+        (compiled, cost, x),
+        (compiled.take(items), cost.take(items), x[items]),
+    ):
+        want = theirs.local_model(at)
+        for got, reference in zip(ours.local_model(at), want, strict=True):
+            size = float(reference.abs().max())
+            torch.testing.assert_close(got, reference, rtol=1e-10, atol=1e-12 * size)
+        assert torch.equal(ours.value(at), ours.local_model(at).value)
+    one = replace(cost, target=cost.target[0])
+    torch.testing.assert_close(one.compiled().value(x), one.value(x))
+
+
+def test_what_has_no_compiled_twin_stays_as_it_is(generator: torch.Generator) -> None:
+    cost = cost_of("arm8", "r_wrist_link", columns=torch.tensor([1, 2]))
+    assert cost.compiled() is cost
+    with pytest.raises(ConfigurationError, match="expected whole states"):
+        FusedTargets.of(cost)

@@ -24,6 +24,7 @@ from torchcss.types import Bounds, CostFunction, LocalModel, Status
 pytestmark = pytest.mark.skipif(not compiler.COMPILED, reason="numba is not installed")
 
 NEWTON = TrustRegionNewton()
+Pool, Trial = trust_region._Pool, trust_region._Trial
 
 
 @dataclass(frozen=True)
@@ -95,18 +96,21 @@ def check_twins(monkeypatch: pytest.MonkeyPatch, tolerance: float) -> list[Tenso
     Returns:
         For every step to come, which items are the same by both.
     """
-    compiled, seen = TrustRegionNewton._advance_compiled, []
+    compiled, twin, seen = Pool.advance_compiled, Pool.advance, []
 
-    def both(self, state, trial, bounds, weight):
-        own = TrustRegionState.of([part.clone() for part in state.tensors])
-        expected = self._advance(own, trial, bounds, weight)
-        got = compiled(self, state, trial, bounds, weight)
-        seen.append(alike(fields(got[0]), fields(expected[0]), tolerance))
-        assert torch.equal(got[1].accepted, expected[1].accepted)
-        assert bool(alike(got[1][1:], expected[1][1:], tolerance).all())
+    def both(self, items, trial):
+        before = self._state.take(torch.arange(len(self._state.status)))
+        expected = twin(self, items, trial)
+        after = self._state.take(items)
+        for into, field in zip(self._state.tensors, before.tensors, strict=True):
+            into.copy_(field)
+        got = compiled(self, items, trial)
+        seen.append(alike(fields(self._state.take(items)), fields(after), tolerance))
+        assert torch.equal(got.accepted, expected.accepted)
+        assert bool(alike(got[1:], expected[1:], tolerance).all())
         return got
 
-    monkeypatch.setattr(TrustRegionNewton, "_advance_compiled", both)
+    monkeypatch.setattr(Pool, "advance_compiled", both)
     return seen
 
 
@@ -180,20 +184,28 @@ def test_what_has_stopped_stays_as_it_is(compiled, monkeypatch, generator):
 def test_an_item_depends_on_no_other(generator):
     """Not on the pool's size, nor on its order, nor on a place in it: bit for bit."""
     cost, x0, bounds = made("body34", generator)
-    start, weight = NEWTON.start(x0), torch.ones(34).double()
+    start, every = NEWTON.start(x0), torch.arange(40)
     state, _ = NEWTON.step(cost, start, bounds)
     assert bool(start.model.value.isinf().all()), "a step leaves the state before as it is"
     for _ in range(6):
         x = bounds.project(state.x + state.step)
         model, share = cost.local_model(x), torch.ones(len(x)).double()
-        trial = trust_region._Trial(x, model, share, torch.inf)
-        own = state.take(torch.arange(len(x)))
-        whole, _ = NEWTON._advance_compiled(own, trial, bounds, weight)
-        for items in (torch.arange(40).flip(0), torch.tensor([17]), torch.arange(5, 29, 3)):
+        whole = state.take(every)
+        Pool(NEWTON, cost, whole, bounds, None).advance_compiled(every, Trial(x, model, share))
+        for items in (every.flip(0), torch.tensor([17]), torch.arange(5, 29, 3)):
             model_of = LocalModel(*(part[items] for part in model))
-            part = trust_region._Trial(x[items], model_of, share[items], torch.inf)
-            some, _ = NEWTON._advance_compiled(state.take(items), part, bounds, weight)
-            assert all(map(torch.equal, fields(some), fields(whole.take(items))))
+            trial = Trial(x[items], model_of, share[items])
+            inside, alone = state.take(every), state.take(items)
+            Pool(NEWTON, cost, inside, bounds, None).advance_compiled(items, trial)
+            first = torch.arange(len(items))
+            Pool(NEWTON, cost, alone, bounds, None).advance_compiled(first, trial)
+            for some in (inside.take(items), alone):
+                assert all(map(torch.equal, fields(some), fields(whole.take(items))))
+            others = torch.tensor([item for item in every.tolist() if item not in items.tolist()])
+            if len(others):
+                assert all(
+                    map(torch.equal, fields(inside.take(others)), fields(state.take(others)))
+                )
         state = whole
 
 

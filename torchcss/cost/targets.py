@@ -24,7 +24,8 @@ from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPairs
 from torchcss.cost.stabiliser import Stabiliser, long_tailed
 from torchcss.errors import ShapeError, check_shape
-from torchcss.types import LocalModel, PointCost, frozen
+from torchcss.kernels import compiler
+from torchcss.types import CostFunction, LocalModel, PointCost, frozen
 
 States = Float[Tensor, "*batch m"]
 
@@ -63,6 +64,16 @@ class PointTargets:
     sticky: bool = True
     repulsion: Interpenetration | None = None
     pairs: InterpenetrationPairs | None = None
+
+    def compiled(self) -> CostFunction:
+        """The same in compiled calls where there are any: for whole states, on a CPU with numba."""
+        whole = self.columns is None and self.repulsion is None
+        if not (whole and self.target.device.type == "cpu" and compiler.AVAILABLE):
+            return self
+        # Importing the kernels takes a third of a second.
+        from torchcss.cost.fused.targets import FusedTargets
+
+        return FusedTargets.of(self)
 
     def take(self, items: Int[Tensor, " b"]) -> PointTargets:
         """The cost of some items; the same where all have the same targets."""

@@ -99,8 +99,9 @@ def make_memory(n: int, real: Any) -> Memory:
 
 @entry
 def advance(
-    items: Items,
+    pool: Array,
     trial: Points,
+    items: Items,
     space: Space,
     rules: Rules,
     memory: Memory,
@@ -110,33 +111,34 @@ def advance(
     """Keep the steps that lower the cost, and plan the next.
 
     Args:
-        items: The pool; what is not `RUNNING` stays as it is.
-        trial: What the cost is at the ends of the steps.
+        pool: Numbers of the items that made a step; what is not `RUNNING` stays as it is.
+        trial: What the cost is at the ends of these steps, one after the other.
+        items: All items.
         space: Bounds and metric.
         rules: Constants.
         memory: Memory for one item.
         accepted: Becomes whether each trial replaced the state.
         decrease: Becomes the decrease of each cost, `-inf` if not finite.
     """
-    for b in range(len(items.radius)):
-        finite = _is_finite(trial, b)
-        decrease[b] = items.at.value[b] - trial.value[b] if finite else -math.inf
-        accepted[b] = False
+    for k in range(len(pool)):
+        b, finite = int(pool[k]), _is_finite(trial, k)
+        decrease[k] = items.at.value[b] - trial.value[k] if finite else -math.inf
+        accepted[k] = False
         if items.status[b] == _RUNNING:
-            accepted[b] = finite and _accepts(decrease[b], items.predicted[b])
-            fell_short = _judge(items, trial, b, space, rules, accepted[b], decrease[b])
+            accepted[k] = finite and _accepts(decrease[k], items.predicted[b])
+            fell_short = _judge(items, b, trial, k, space, rules, accepted[k], decrease[k])
             if items.status[b] == _RUNNING:
                 _plan(items, b, space, rules, memory, fell_short)
 
 
 @kernel
-def _is_finite(trial: Points, b: int) -> bool:
+def _is_finite(trial: Points, k: int) -> bool:
     """Whether all is finite: then a sum is, short of overflow."""
-    total = trial.value[b]
+    total = trial.value[k]
     for i in range(trial.x.shape[1]):
-        total += trial.gradient[b, i] + trial.x[b, i] * 0.0
+        total += trial.gradient[k, i] + trial.x[k, i] * 0.0
         for j in range(trial.x.shape[1]):
-            total += trial.hessian[b, i, j]
+            total += trial.hessian[k, i, j]
     return np.isfinite(total)
 
 
@@ -149,14 +151,15 @@ def _accepts(decrease: float, predicted: float) -> bool:
 @kernel
 def _judge(
     items: Items,
-    trial: Points,
     b: int,
+    trial: Points,
+    k: int,
     space: Space,
     rules: Rules,
     accepted: bool,
     decrease: float,
 ) -> bool:
-    """Radius, damping and status after a trial; take its place if it is accepted.
+    """Radius, damping and status of item b after trial k; take its place if it is accepted.
 
     Returns whether the step promised less than the tolerance, and fell short even of that.
     """
@@ -170,14 +173,14 @@ def _judge(
         fell_short = shrinks and predicted < rules.tolerance
     if accepted:
         before = _norm(at.gradient[b], space.inverse)
-        after = _norm(trial.gradient[b], space.inverse)
+        after = _norm(trial.gradient[k], space.inverse)
         if after < before:
             items.damping[b] *= after / before
-        at.value[b], at.share[b] = trial.value[b], trial.share[b]
+        at.value[b], at.share[b] = trial.value[k], trial.share[k]
         for i in range(at.x.shape[1]):
-            at.x[b, i], at.gradient[b, i] = trial.x[b, i], trial.gradient[b, i]
+            at.x[b, i], at.gradient[b, i] = trial.x[k, i], trial.gradient[k, i]
             for j in range(at.x.shape[1]):
-                at.hessian[b, i, j] = trial.hessian[b, i, j]
+                at.hessian[b, i, j] = trial.hessian[k, i, j]
     elif math.isinf(at.value[b]):
         items.status[b] = _NON_FINITE
     return fell_short

@@ -147,13 +147,11 @@ class _Trial(NamedTuple):
         x: The states, admissible.
         model: Cost and derivatives.
         share: Which share of the second-order parts the Hessians contain.
-        greatest_radius: Bound on trust radii.
     """
 
     x: Vectors
     model: LocalModel
     share: Numbers
-    greatest_radius: float
 
 
 _PINNING_ROUNDS = 12
@@ -236,64 +234,16 @@ class TrustRegionNewton:
             The next state, and what became of the steps. Of an item that is not finite at the
             start, the state has `Status.NON_FINITE` and the start as given.
         """
-        fields = [f.clone(memory_format=torch.contiguous_format) for f in state.tensors]
-        return self._step(cost, TrustRegionState.of(fields), bounds, scale)
-
-    def _step(
-        self, cost: CostFunction, state: TrustRegionState, bounds: Bounds, scale: Vector | None
-    ) -> tuple[TrustRegionState, TrustRegionInfo]:
-        """The same from a state whose memory is nobody else's: it may become the next one's."""
-        bounds, weight = bounds.to(state.x), state.x.new_ones(state.x.shape[-1])
-        if scale is not None:
-            weight = scale.to(state.x).square().reciprocal()
-        candidate = bounds.project(state.x + state.step)
-        greatest_radius = torch.inf
-        if isinstance(cost, BlendedCost):
-            greatest_radius = self.initial_radius
-            share = _share_of_second_order(state.model.value, state.predicted)
-            model = cost.blended_model(candidate, share)
-        else:
-            share = torch.ones_like(state.radius)
-            model = cost.local_model(candidate)
-        model = _checked(model, candidate)
-        trial = _Trial(candidate, model, share, greatest_radius)
-        if _is_compiled(candidate):
-            return self._advance_compiled(state, trial, bounds, weight)
-        return self._advance(state, trial, bounds, weight)
-
-    def _advance_compiled(
-        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector
-    ) -> tuple[TrustRegionState, TrustRegionInfo]:
-        """The same as `_advance` in one compiled call, and in the memory of the state."""
-        from torchcss.inference import planning  # compiled: only where it is used
-
-        info = TrustRegionInfo(
-            torch.empty_like(state.status, dtype=torch.bool), torch.empty_like(state.radius)
-        )
-        arrays = [_array(field) for field in state.tensors]
-        real: Any = np.float32 if state.x.dtype == torch.float32 else np.float64
-        run(
-            planning.advance,
-            planning.Items(planning.Points(*arrays[:5]), *arrays[5:]),
-            planning.Points(*map(_array, (trial.x, *trial.model, trial.share))),
-            planning.Space(*map(_array, (*bounds, weight, weight.reciprocal()))),
-            planning.Rules(
-                tolerance=real(self.tolerance),
-                greatest_radius=real(trial.greatest_radius),
-                factorisations=self.factorisations,
-                pinning_rounds=_PINNING_ROUNDS,
-                max_steps=self.max_steps,
-            ),
-            planning.make_memory(state.x.shape[-1], real),
-            *map(_array, info),
-        )
-        return state, info
+        items = torch.arange(len(state.status), device=state.x.device)
+        after = state.take(items)
+        info = _Pool(self, cost, after, bounds, scale).step(cost, items)
+        return after, info
 
     def _advance(
-        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector
+        self, state: TrustRegionState, trial: _Trial, bounds: Bounds, weight: Vector, reach: float
     ) -> tuple[TrustRegionState, TrustRegionInfo]:
-        """Keep the trials that lower the cost, and plan the next steps."""
-        candidate, model, share, greatest_radius = trial
+        """Keep the trials that lower the cost, and plan steps no longer than a reach."""
+        candidate, model, share = trial
         running, value = state.status == Status.RUNNING, state.model.value
         finite = _is_finite(model) & candidate.isfinite().all(-1)
         decrease = torch.where(finite, value - model.value, -torch.inf)
@@ -301,7 +251,7 @@ class TrustRegionNewton:
         ratio = decrease / torch.where(stays, 1.0, state.predicted)
         accepted = running & finite & (stays | ((decrease >= 0) & (ratio > LEAST_RATIO)))
         length = _norm(state.step, weight)
-        radius = _next_radius(state.radius, length, ratio, accepted).clamp(max=greatest_radius)
+        radius = _next_radius(state.radius, length, ratio, accepted).clamp(max=reach)
         unusable = running & value.isinf() & ~accepted
         fell_short = ~stays & (~accepted | (radius < length)) & (state.predicted < self.tolerance)
         state = TrustRegionState(
@@ -392,26 +342,21 @@ class TrustRegionNewton:
             bounds: Box limits on the state.
             scale: See `step`.
         """
-        bounds = bounds.to(state.x)
         limited = (state.status == Status.STEP_LIMIT) & (state.num_steps < self.max_steps)
         status = torch.where(limited, int(Status.RUNNING), state.status)
         result = state._replace(status=status).take(torch.arange(len(status), device=status.device))
         size = self.pool_size or (_POOL_SIZE if status.device.type == "cpu" else len(status))
         queue = torch.nonzero(status == Status.RUNNING)[:, 0]
         items, queue = queue[:size], queue[size:]
-        pool = result.take(items)
+        pool = _Pool(self, cost, result, bounds, scale)
         part = cost if len(items) == len(status) else cost.take(items)
         while len(items):
-            pool, _ = self._step(part, pool, bounds, scale)
-            left = torch.nonzero(pool.status == Status.RUNNING)[:, 0]
-            places = len(items) - len(left)
-            if not places:
-                continue
-            for into, field in zip(result.tensors, pool.tensors, strict=True):
-                into.index_copy_(0, items, field)
-            # Waiting items take the places of finished ones; when none waits the pool shrinks.
-            items, queue = torch.cat([items[left], queue[:places]]), queue[places:]
-            pool, part = result.take(items), cost.take(items)
+            pool.step(part, items)
+            left = items[result.status.index_select(0, items) == Status.RUNNING]
+            if places := len(items) - len(left):
+                # Waiting items take the places of finished ones; when none waits fewer are left.
+                items, queue = torch.cat([left, queue[:places]]), queue[places:]
+                part = cost.take(items)
         return result
 
     def modes(
@@ -481,6 +426,95 @@ class TrustRegionNewton:
             damping=torch.where(running, damping, state.damping),
             predicted=torch.where(running, torch.where(again, 0.0, predicted), state.predicted),
             status=torch.where(ends & exact, reason, state.status),
+        )
+
+
+class _Pool:
+    """Items that are advanced side by side, in the memory of their state.
+
+    Args:
+        newton: The optimiser.
+        cost: What is minimised.
+        state: Where they stand; nobody else's, as `TrustRegionState.take` makes it.
+        bounds: Box limits.
+        scale: See `TrustRegionNewton.step`.
+    """
+
+    def __init__(
+        self,
+        newton: TrustRegionNewton,
+        cost: CostFunction,
+        state: TrustRegionState,
+        bounds: Bounds,
+        scale: Vector | None,
+    ) -> None:
+        self._newton, self._state, self._bounds = newton, state, bounds.to(state.x)
+        self._blends = isinstance(cost, BlendedCost)
+        self._reach = newton.initial_radius if self._blends else torch.inf
+        self._weight = state.x.new_ones(state.x.shape[-1])
+        if scale is not None:
+            self._weight = scale.to(state.x).square().reciprocal()
+        self._packed = self._pack() if _is_compiled(state.x) else None
+
+    def step(self, cost: CostFunction, items: Items) -> TrustRegionInfo:
+        """Evaluate the planned steps of some items, and plan their next ones.
+
+        Args:
+            cost: The cost of these items.
+            items: Which items; what is not `RUNNING` stays as it is.
+        """
+        state = self._state
+        x, step = (field.index_select(0, items) for field in (state.x, state.step))
+        x = self._bounds.project(x + step)
+        share = x.new_ones(len(x))
+        if self._blends:
+            assert isinstance(cost, BlendedCost)
+            share = _share_of_second_order(state.model.value[items], state.predicted[items])
+            model = cost.blended_model(x, share)
+        else:
+            model = cost.local_model(x)
+        trial = _Trial(x, _checked(model, x), share)
+        return (self.advance if self._packed is None else self.advance_compiled)(items, trial)
+
+    def advance(self, items: Items, trial: _Trial) -> TrustRegionInfo:
+        """Keep the trials that lower the cost, and plan the next steps of their items."""
+        before, space = self._state.take(items), (self._bounds, self._weight)
+        after, info = self._newton._advance(before, trial, *space, self._reach)
+        for into, field in zip(self._state.tensors, after.tensors, strict=True):
+            into.index_copy_(0, items, field)
+        return info
+
+    def advance_compiled(self, items: Items, trial: _Trial) -> TrustRegionInfo:
+        """The same in one compiled call."""
+        from torchcss.inference import planning  # compiled: only where it is used
+
+        assert self._packed is not None
+        accepted, decrease = (
+            torch.empty_like(items, dtype=torch.bool),
+            torch.empty_like(trial.share),
+        )
+        tried = planning.Points(*map(_array, (trial.x, *trial.model, trial.share)))
+        run(planning.advance, _array(items), tried, *self._packed, accepted, decrease)
+        return TrustRegionInfo(accepted, decrease)
+
+    def _pack(self) -> tuple[Any, ...]:
+        """What the kernel needs to know of the state, the space and the rules."""
+        from torchcss.inference import planning
+
+        newton, weight = self._newton, self._weight
+        arrays = [field.numpy() for field in self._state.tensors]
+        real: Any = arrays[0].dtype.type
+        return (
+            planning.Items(planning.Points(*arrays[:5]), *arrays[5:]),
+            planning.Space(*map(_array, (*self._bounds, weight, weight.reciprocal()))),
+            planning.Rules(
+                tolerance=real(newton.tolerance),
+                greatest_radius=real(self._reach),
+                factorisations=newton.factorisations,
+                pinning_rounds=_PINNING_ROUNDS,
+                max_steps=newton.max_steps,
+            ),
+            planning.make_memory(len(weight), real),
         )
 
 

@@ -331,14 +331,14 @@ def place_joints(
         bounds: Box limits.
         steps: How long each is looked for.
     """
-    reach = PointTargets(
+    cost = PointTargets(
         body=body,
         link=body.marker_link[segments.joint],
         offset=body.marker_offset[segments.joint],
         target=target,
         sigma=target.new_full(target.shape[1:2], _ON_PLACE),
-    )
-    return TrustRegionNewton(max_steps=steps, tolerance=0.1).ends(reach, start, bounds)
+    ).compiled()
+    return TrustRegionNewton(max_steps=steps, tolerance=0.1).ends(cost, start, bounds)
 
 
 def all_ways(bits: int, device: torch.device) -> Bool[Tensor, "w b"]:

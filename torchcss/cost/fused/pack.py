@@ -46,6 +46,8 @@ from torchcss.cost.fused.records import (
     Rays,
     Repulsion,
     Seen,
+    Targets,
+    TargetScratch,
     Tree,
     Workspace,
 )
@@ -55,6 +57,7 @@ from torchcss.cost.joints import OUTLIER_LENGTHS, JointTerm
 from torchcss.cost.pose_prior import TRUNK, BodyDensity, Directions, Group, side_of
 from torchcss.cost.region import RegionTerm
 from torchcss.cost.stabiliser import Stabiliser
+from torchcss.cost.targets import PointTargets
 from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import BEHIND, CLEARANCE, RAMP, ContourPredictor, tabulate_parts
@@ -86,15 +89,17 @@ def in_precision(record: _Record, real: Real) -> _Record:
     return fields._make(map(converted, record))
 
 
-def pack_tree(body: BodyModel, camera: Camera) -> Tree:
-    """A body's tree before a camera."""
+def pack_tree(body: BodyModel, camera: Camera | None) -> Tree:
+    """A body's tree before a camera; None: in the world."""
     tree = body.tree
     tie = array(body.tie)
     column = np.abs(tie).argmax(1)
-    turn = array(camera.R_camera_world)
+    turn, shift = np.eye(3), np.zeros(3)
+    if camera is not None:
+        turn, shift = array(camera.R_camera_world), array(camera.t_camera_world)
     base = np.empty((3, 4))
     base[:, :3] = turn @ array(body.base_rotation)
-    base[:, 3] = turn @ array(body.base_translation) + array(camera.t_camera_world)
+    base[:, 3] = turn @ array(body.base_translation) + shift
     return Tree(
         column=column,
         factor=tie[np.arange(len(column)), column],
@@ -120,9 +125,12 @@ def _row(tree: KinematicTree, place: Tensor) -> Array:
 
 def carried_markers(body: BodyModel, marker: Tensor) -> tuple[Array, Array]:
     """Rows of the frames that carry some joint centres, and their places in these frames."""
-    offset = body.marker_offset[marker]
+    return _carried_points(body, body.marker_link[marker], body.marker_offset[marker])
+
+
+def _carried_points(body: BodyModel, link: Tensor, offset: Tensor) -> tuple[Array, Array]:
     homogeneous = torch.cat([offset, torch.ones_like(offset[:, :1])], dim=1)[:, :, None]
-    row, place = carried(body, body.marker_link[marker], homogeneous)
+    row, place = carried(body, link, homogeneous)
     return row, place[:, :, 0].copy()
 
 
@@ -474,11 +482,31 @@ def pack_priors(
             far = 1e-4 * (torch.finfo(body.dtype).max / most) ** 0.5
             fields = (array(field) for field in density)
             mixture = Mixture(weight, term.height(size), far, *fields)
+    return _long_tails(tails, size), gaussian, mixture
+
+
+def pack_targets(targets: PointTargets) -> tuple[Tree, Targets, LongTails, TargetScratch]:
+    """Points against known places, with the stabilisers."""
+    body, tree = targets.body, pack_tree(targets.body, None)
+    row, own = _carried_points(body, targets.link, targets.offset)
+    place = array(targets.target.reshape(-1, *own.shape))
+    joints, rest, deviation = len(tree.parent), body.sticky_mean, body.sticky_deviation
+    tails = [(1.0, Stabiliser.nu, array(rest[None]), _sharpness(deviation))][: targets.sticky]
+    numbers = np.zeros((len(Points._fields) - 1, len(row)))
+    points = Points._make([*numbers, np.zeros(0, np.int64)])
+    frames, twists, sums = np.zeros((1 + joints, 3, 4)), np.zeros((joints, 6)), (1 + joints, 33)
+    scratch = TargetScratch(frames, np.zeros(3), twists, np.zeros(sums), points)
+    stiffness = array(targets.sigma.pow(-2))
+    return tree, Targets(row, own, place, stiffness), _long_tails(tails, len(rest)), scratch
+
+
+def _long_tails(tails: Sequence[tuple[float, float, Array, Array]], size: int) -> LongTails:
+    """Priors of weight, height, centres and sharpness, one after the other."""
     modes = max((len(centre) for _, _, centre, _ in tails), default=1)
     centres = [np.broadcast_to(centre, (modes, size)) for _, _, centre, _ in tails]
     weight, nu, sharpness = (np.array([tail[k] for tail in tails]) for k in (0, 1, 3))
     centre, sharpness = np.reshape(centres, (-1, modes, size)), sharpness.reshape(-1, size)
-    return LongTails(weight, nu, centre, sharpness), gaussian, mixture
+    return LongTails(weight, nu, centre, sharpness)
 
 
 def _sharpness(deviation: Tensor) -> Array:

@@ -37,7 +37,7 @@ def add_priors(
     """
     for b in range(len(x)):
         gradient, hessian = result.gradient[b], result.hessian[b]
-        result.value[b] += _long_tails(x[b], mode[b], tails, gradient, hessian)
+        result.value[b] += long_tails(x[b], mode[b], tails, gradient, hessian)
         result.value[b] += _gaussian(x[b], gaussian, scratch.pull, gradient, hessian)
         if mixture.weight > 0.0:
             value = _mixture(x[b], mixture, scratch)
@@ -47,7 +47,7 @@ def add_priors(
 
 
 @kernel
-def _long_tails(x: Array, mode: int, tails: LongTails, gradient: Array, hessian: Array) -> float:
+def long_tails(x: Array, mode: int, tails: LongTails, gradient: Array, hessian: Array) -> float:
     """Lorentzian priors of single parameters."""
     total = 0.0
     for prior in range(len(tails.nu)):

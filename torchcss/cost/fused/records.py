@@ -379,6 +379,21 @@ Attributes:
 """
 
 
+Targets = namedtuple("Targets", "row own place stiffness")
+"""Points of the body and where they should be; see `torchcss.cost.targets.PointTargets`.
+
+Attributes:
+    row: Row of the frame that carries each point.
+    own: Its place in that frame.
+    place: Where it should be, `[b points 3]`, or the same for all states, `[1 points 3]`.
+    stiffness: Reciprocal variance of each, per square metre.
+"""
+
+
+TargetScratch = namedtuple("TargetScratch", "frames reference twists sums points")
+"""The part of a `Workspace` that `Targets` need."""
+
+
 Result = namedtuple("Result", "value gradient hessian")
 """Cost and derivatives of a pool, double precision; a call adds to it.
 

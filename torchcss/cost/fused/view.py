@@ -39,7 +39,7 @@ def add_view(
         pose_tree(x[b], tree, workspace.frames)
         pose_parts(workspace.frames, parts, workspace.frame, workspace.posed)
         if slopes:
-            _choose_reference(workspace.frames, workspace.reference)
+            choose_reference(workspace.frames, workspace.reference)
             workspace.sums[:] = 0.0
         if view.edges.scale > 0.0 or view.colours.scale > 0.0:
             result.value[b] += find_and_compare_outline(parts, view, slopes, workspace)
@@ -61,7 +61,7 @@ def add_view(
 
 
 @kernel
-def _choose_reference(frames: Array, reference: Array) -> None:
+def choose_reference(frames: Array, reference: Array) -> None:
     """A place near the body: the middle of its joints."""
     share = 1.0 / len(frames)
     for i in range(3):
