@@ -257,7 +257,7 @@ def test_a_demo_tells_of_a_file_that_is_there(tmp_path: Path, capsys: pytest.Cap
 
 @pytest.mark.parametrize("option", [("--evidence", "0.3"), ("--evidence=0.3",)])
 def test_options_of_version_0_1_are_understood(files: Path, option: tuple[str, ...]):
-    assert track(files, "--no-overlay", *option) == 0
+    assert track(files, "--no-overlay", "--no-recovery", *option) == 0
     settings = json.loads((files / "out" / "summary.json").read_text())["settings"]
     assert settings["likelihood_power"] == 0.3
 

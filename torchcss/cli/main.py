@@ -96,6 +96,9 @@ _OLD_NAMES = {
 }
 """Options of version 0.1 that are written otherwise now; not in the help."""
 
+_OF_NO_USE = ("--no-recovery",)
+"""Options of version 0.1 that say what is so anyway."""
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line.
@@ -110,7 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # names may have signs that a terminal has not
         sys.stdout.reconfigure(errors="backslashreplace")
     words = sys.argv[1:] if arguments is None else arguments
-    options = [word.partition("=") for word in words]
+    options = [word.partition("=") for word in words if word not in _OF_NO_USE]
     words = ["".join((_OLD_NAMES.get(name, name), *value)) for name, *value in options]
     verb = None
     try:
