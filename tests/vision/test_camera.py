@@ -359,6 +359,9 @@ def test_cropped_camera_follows_the_image(generator: torch.Generator) -> None:
     camera = make_camera(MILD)
     points = torch.randn(50, 3, dtype=torch.float64, generator=generator) * 0.3
     part = camera.cropped(30, -20, 50, 60)
+    assert camera.K[0, 2] - part.K[0, 2] == 30, "the whole image's camera stays"
+    assert torch.equal(part.R_camera_world, camera.R_camera_world)
+    assert set(part.state_dict()) == set(camera.state_dict())
     assert part.image_size_wh == (50, 60)
     away = torch.tensor([30.0, -20.0], dtype=torch.float64)
     torch.testing.assert_close(part.project(points).uv, camera.project(points).uv - away)
