@@ -14,9 +14,9 @@ import warnings
 from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -45,7 +45,7 @@ from torchcss.cost.temporal import MixturePrior, TemporalPrior
 from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.kernels import compiler
-from torchcss.kernels.checked import run
+from torchcss.kernels.versions import version_of
 from torchcss.types import Curvature, LocalModel
 
 if TYPE_CHECKING:
@@ -110,7 +110,8 @@ class Workspaces:
         self._idle.append(workspace)
 
 
-class _Packed(NamedTuple):
+@dataclass(frozen=True)
+class _Packed:
     """What a kernel is called with, besides states and results.
 
     Attributes:
@@ -119,6 +120,7 @@ class _Packed(NamedTuple):
         modes: How many modes before samples are compared with; zero: with none.
         records: What it reads.
         workspaces: Memory for what it finds on the way.
+        versions: The kernels for the types of all this, by what they are called with.
     """
 
     kernel: Callable[..., None]
@@ -126,6 +128,7 @@ class _Packed(NamedTuple):
     modes: int
     records: tuple[Any, ...]
     workspaces: Workspaces
+    versions: dict[int, Callable[..., None]] = field(default_factory=dict)
 
     def add(self, states: Sequence[Array], mode: Array | None, result: Result) -> None:
         """Add the kernel's costs of some samples, each compared with a mode.
@@ -142,7 +145,10 @@ class _Packed(NamedTuple):
             states = states[:1]
         rows = (_rows(mode, self.modes, len(states[0])),) if self.modes else ()
         workspace = self.workspaces.take()
-        run(kernel, *states, *rows, *self.records, workspace, result)
+        arguments = *states, *rows, *self.records, workspace, result
+        if len(states) not in self.versions:
+            self.versions[len(states)] = version_of(kernel, *arguments)
+        self.versions[len(states)](*arguments)
         self.workspaces.give_back(workspace)
 
 
@@ -256,8 +262,8 @@ class FusedEngine:
             if items is not None:
                 for whole, some in zip(result, own, strict=True):
                     whole[items] = some
-        for field in () if all_sane else result:
-            field[~sane] = np.nan
+        for numbers in () if all_sane else result:
+            numbers[~sane] = np.nan
         if not left_out:
             return result, None
         return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
@@ -282,7 +288,7 @@ class FusedEngine:
             return
 
         def add(rows: slice) -> None:
-            part, some = Result(*(field[rows] for field in result)), [x[rows] for x in states]
+            part, some = Result(*(each[rows] for each in result)), [x[rows] for x in states]
             for packed, mode in calls:
                 packed.add(some, None if mode is None else mode[rows], part)
 
@@ -390,8 +396,8 @@ class FusedEngine:
                 others.add(term.name)
             else:
                 scale = cost.choice.weight(term.name) * bound.scale
-                field = _IMAGES[kind][0]
-                made[field] = record._replace(scale=self._precision(field)(scale))
+                name = _IMAGES[kind][0]
+                made[name] = record._replace(scale=self._precision(name)(scale))
         if not made:
             return [], frozenset(others)
         predictor = None
@@ -427,16 +433,16 @@ class FusedEngine:
 
     def _pack_image(self, term: Any, bound: OnPoints, context: FrameContext) -> Any:
         """The record of an image term, without its weight; None: its twin does not know it."""
-        field, make = _IMAGES[type(term)]
+        name, make = _IMAGES[type(term)]
         record = make(term, bound, context)
-        return None if record is None else pack.in_precision(record, self._precision(field))
+        return None if record is None else pack.in_precision(record, self._precision(name))
 
     def _absent(self, num_parts: int) -> dict[str, Any]:
         records = pack.absent(num_parts).items()
         return {name: pack.in_precision(record, self._precision(name)) for name, record in records}
 
-    def _precision(self, field: str) -> Any:
-        return np.float64 if field == "keypoints" else self.real
+    def _precision(self, name: str) -> Any:
+        return np.float64 if name == "keypoints" else self.real
 
 
 def _is_exact(cost: TrackingCost) -> bool:
@@ -446,11 +452,11 @@ def _is_exact(cost: TrackingCost) -> bool:
 
 def _repeat_for_all_modes(records: dict[str, Any], *fields: str) -> None:
     """Give records the targets of as many modes each: what is the same for all is repeated."""
-    modes = max(len(records[field].target) for field in fields)
-    for field in fields:
-        target = records[field].target
+    modes = max(len(records[name].target) for name in fields)
+    for name in fields:
+        target = records[name].target
         if len(target) < modes:
-            records[field] = records[field]._replace(target=np.repeat(target, modes, 0))
+            records[name] = records[name]._replace(target=np.repeat(target, modes, 0))
 
 
 def _rows(parent: Array | None, modes: int, size: int) -> Array:
