@@ -1,4 +1,4 @@
-"""Losses told from the costs, and the wider search."""
+"""Losses told from the costs."""
 
 from __future__ import annotations
 

@@ -311,8 +311,7 @@ class Tracker(SequenceTracker):
         likelihood_power: Power of a frame's likelihood in the weights, step 3, and in the
             covariances that are stated. One is Fig. 6, which takes frames as independent evidence.
             They are not: what a body model lacks, clutter and occlusion cost the same modes in
-            frame after frame. With a sharp likelihood the first frames then decide for good, or,
-            where much is forgotten, each frame anew.
+            frame after frame. With a sharp likelihood the first frames then decide for good.
         coarse_every: If the problem has a coarse cost, every so many samples descend on that first,
             so that what moved farther than the cost's own basin reaches is found again; 0 for
             never. As many of them as there are modes begin at the modes: one that is seldom sampled
