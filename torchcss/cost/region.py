@@ -63,8 +63,7 @@ _ARM_MARGIN = 2
 """Pixels off the outline of a tracked body from which on colours are taken for the part's own too:
 of a wide part the core lacks the shade along the outline. A pose is off by less than these, and
 only the trunk of a person seen close is wide enough to have them. The outline of an arm is known
-better, since it hangs on a base that is told. `docs/findings.md` has what other margins, and the
-core alone, do to the tracks."""
+better, since it hangs on a base that is told."""
 
 _CORE_PIXELS = 60
 """Fewest pixels that tell colours; of a part with a smaller core all but its outline are taken."""

@@ -10,7 +10,7 @@ the tanh that keeps single pixels from deciding.
 It has no derivatives in the pose, and is dear. It therefore stays out of the descents, and is asked
 of the minima that they find, where the weights are made (step 3 of Fig. 6 [IJRR]):
 `TrackingCost.weight_only`. The papers have no such term; section 8 [IJRR] expects help of
-silhouettes. Here it tells good modes from bad ones better than the weights of all other terms do
+silhouettes. In the mean over clips it changes little; on some it decides which pose leads
 (`docs/findings.md`).
 
 It asks for a body that is modelled whole. Of an arm alone it would be led astray by the rest of

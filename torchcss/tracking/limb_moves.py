@@ -11,8 +11,7 @@ what remains: it is a move as in `torchcss.tracking.flip_moves`, for another rea
 
 An arm that is hidden, or out of the picture, explains nothing either; it is found when it comes out
 elsewhere than expected. Legs are left alone. Arms swing, but legs stand: where one is astray, the
-body has turned or gone, and a leg put elsewhere explains what the trunk has left uncovered (tried:
-`docs/findings.md`).
+body has turned or gone, and a leg put elsewhere explains what the trunk has left uncovered.
 """
 
 from __future__ import annotations
