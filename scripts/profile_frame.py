@@ -29,6 +29,7 @@ from common import Table, start, write_report
 from torchcss.app.track import track_video
 from torchcss.cli.options import SettingsOptions
 from torchcss.cost.frame import FrameCosts
+from torchcss.cost.fused import engine
 from torchcss.cost.fused.engine import FusedEngine
 from torchcss.inference import tracker, trust_region
 from torchcss.inference.trust_region import TrustRegionNewton
@@ -171,6 +172,8 @@ def timing() -> Iterator[Clock]:
         for module in list(sys.modules.values()):
             if module.__name__.startswith("torchcss.") and vars(module).get("run") is run:
                 stack.enter_context(patch.object(module, "run", clock.kernel(run)))
+        terms = clock.kernel(engine._Packed.add)
+        stack.enter_context(patch.object(engine._Packed, "add", terms))
         yield clock
 
 

@@ -78,7 +78,7 @@ from torchcss.tracking.settings import Settings
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 REST, ALL = "the rest", "all"
-KERNELS = {"add_view": "keypoints", "advance": "planning"}
+KERNELS = {"add_view": "keypoints"}
 """Stages of the fused engine's kernels by name; others are of priors."""
 REASONS = {
     "drawing": (
@@ -203,12 +203,18 @@ def seconds_of(config: Config, call: Callable[[], Any]) -> float:
 
 def fused_stages(config: Config, work: Work, step: Step) -> dict[str, float]:
     """Times of an iteration's kernels; what is drawn is drawn by torch."""
-    spent, calls = dict.fromkeys(STAGES, 0.0), 0
+    spent, calls, add_terms = dict.fromkeys(STAGES, 0.0), 0, engine._Packed.add
 
-    def run(kernel: Callable[..., None], *arguments: Any) -> None:
+    def add(packed: engine._Packed, *arguments: Any) -> None:
         begin = time.process_time()
-        checked.run(kernel, *arguments)
-        spent[KERNELS.get(kernel.__name__, "priors")] += time.process_time() - begin
+        add_terms(packed, *arguments)
+        name = KERNELS.get(packed.kernel.__name__, "priors")
+        spent[name] += time.process_time() - begin
+
+    def run(*arguments: Any) -> None:
+        begin = time.process_time()
+        checked.run(*arguments)
+        spent["planning"] += time.process_time() - begin
 
     def iterate() -> None:
         nonlocal calls
@@ -218,7 +224,7 @@ def fused_stages(config: Config, work: Work, step: Step) -> dict[str, float]:
     def draw(frame: FrameData, _: Any, __: Tensor, scale: float) -> Tensor:
         return scaled_draw(frame.mean, frame.factor, frame.noise, scale)
 
-    with patch.object(engine, "run", run), patch.object(trust_region, "run", run):
+    with patch.object(engine._Packed, "add", add), patch.object(trust_region, "run", run):
         seconds_of(config, iterate)
     times = {name: seconds / calls for name, seconds in spent.items()}
     return times | {"drawing": seconds_of(config, partial(work.call, draw))}
