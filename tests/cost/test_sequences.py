@@ -10,6 +10,7 @@ from made_costs import changed, make_full_cost, random_states
 
 from torchcss.body.shape import with_shape
 from torchcss.cost.context import BodyTables
+from torchcss.cost.fused.engine import FusedEngine
 from torchcss.cost.total import TrackingCost, numbered, together
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.types import Keypoints
@@ -93,3 +94,24 @@ def test_one_clip_is_the_case_of_one(generator: torch.Generator) -> None:
     x = random_states(first.body, 3, generator=generator)
     alone = together([first], torch.zeros(3, dtype=torch.long))
     torch.testing.assert_close(alone.value(x), first.value(x), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_share_out_the_samples_of_all_clips(
+    threads: int, generator: torch.Generator
+) -> None:
+    costs = [
+        numbered(replace(cost, engine=FusedEngine("float64", threads)), number)
+        for number, cost in enumerate(two_clips())
+    ]
+    sequence = torch.tensor([1, 0, 1, 1, 0, 0, 1])
+    x = random_states(costs[0].body, len(sequence), generator=generator)
+    x[2, 0] = torch.nan
+    whole = together(costs, sequence).local_model(x)
+    for number, cost in enumerate(costs):
+        own = cost.local_model(x[sequence == number])
+        for got, expected in zip(whole, own, strict=True):
+            torch.testing.assert_close(
+                got[sequence == number], expected, rtol=0, atol=0, equal_nan=True
+            )
+    assert [int(row) for row in whole.value.isnan().nonzero()] == [2]

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -152,6 +152,59 @@ class _Packed:
         self.workspaces.give_back(workspace)
 
 
+class _Samples(NamedTuple):
+    """What the kernels are to evaluate, sequence by sequence.
+
+    Attributes:
+        states: The samples, and maybe where visibility and matches are found.
+        parent: The mode before that what the views saw is taken from, for each.
+        component: The component of the prior that it is compared with.
+        result: What the costs are added to.
+    """
+
+    states: Sequence[Array]
+    parent: Array | None
+    component: Array | None
+    result: Result
+
+    def take(self, rows: slice) -> _Samples:
+        """Some of them, in the same memory."""
+        parent, component = (
+            None if index is None else index[rows] for index in (self.parent, self.component)
+        )
+        states, result = (
+            [x[rows] for x in self.states],
+            Result(*(each[rows] for each in self.result)),
+        )
+        return _Samples(states, parent, component, result)
+
+
+class _Job(NamedTuple):
+    """What is to be done for the samples of one sequence.
+
+    Attributes:
+        begin: The first of them.
+        end: One beyond the last.
+        priors: Kernels of priors.
+        views: Kernels of views.
+    """
+
+    begin: int
+    end: int
+    priors: Sequence[_Packed]
+    views: Sequence[_Packed]
+
+    def add(self, samples: _Samples, begin: int, end: int) -> None:
+        """Add the costs of those that are among some of all samples."""
+        begin, end = max(self.begin, begin), min(self.end, end)
+        if begin < end:
+            some = samples.take(slice(begin, end))
+            for packed in self.priors:
+                packed.add(some.states, some.component, some.result)
+            for packed in self.views:
+                packed.add(some.states, some.parent, some.result)
+
+
 _Found = tuple[list[_Packed], frozenset[str]]
 """What is packed, and the names of the terms that are not."""
 
@@ -227,80 +280,63 @@ class FusedEngine:
             slopes: Whether to find derivatives.
         """
         each = [pack.array(x.reshape(-1, x.shape[-1])) for x in states]
-        size, n = each[0].shape
-        width = n if slopes else 0
-        result = Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
+        order, ends = _by_sequence(cost, each)
         parent, component = (
             None if index is None else pack.array(index, np.int64)
             for index in (cost.parent, cost.component)
         )
         component = parent if component is None else component
-        sane = np.isfinite(each[0]).all(1)
-        if len(each) > 1:
-            sane &= np.isfinite(each[1]).all(1)
-        all_sane = bool(sane.all())
+        if order is not None:
+            each = [x[order] for x in each]
+            parent, component = (
+                None if index is None else index[order] for index in (parent, component)
+            )
+        result = _zeros(each[0].shape, slopes)
+        jobs: list[_Job] = []
         left_out: set[str] = set()
-        for past in cost.past:
-            items = None
-            if cost.sequence is not None:
-                items = (cost.sequence == past.sequence).numpy() & sane
-            elif not all_sane:
-                items = sane
-            part = each if items is None else [np.ascontiguousarray(x[items]) for x in each]
-            own = result if items is None else Result(*(np.zeros_like(p[items]) for p in result))
-            packed, others = self._prior(cost, past)
-            compared = component if component is None or items is None else component[items]
-            calls = [(each, compared) for each in packed]
+        begin = 0
+        for past, end in zip(cost.past, ends, strict=True):
+            priors, others = self._prior(cost, past)
             left_out |= others
-            compared = parent if parent is None or items is None else parent[items]
+            views: list[_Packed] = []
             for view in cost.views:
                 if view.sequence == past.sequence:
                     packed, others = self._view(cost, past, view)
-                    calls += [(each, compared) for each in packed]
+                    views += packed
                     left_out |= others
-            self._share_out(calls, part, own)
-            if items is not None:
-                for whole, some in zip(result, own, strict=True):
-                    whole[items] = some
-        for numbers in () if all_sane else result:
-            numbers[~sane] = np.nan
+            jobs.append(_Job(begin, end, priors, views))
+            begin = end
+        self._share_out(_Samples(each, parent, component, result), jobs)
+        if order is not None:
+            whole = _zeros((states[0].shape[:-1].numel(), states[0].shape[-1]), slopes)
+            for numbers, some in zip(whole, result, strict=True):
+                numbers.fill(np.nan)
+                numbers[order] = some
+            result = whole
         if not left_out:
             return result, None
         return result, replace(cost, engine=None, choice=cost.choice.only(left_out))
 
-    def _share_out(
-        self,
-        calls: Sequence[tuple[_Packed, Array | None]],
-        states: Sequence[Array],
-        result: Result,
-    ) -> None:
-        """Add the costs that kernels find for some states, shared out among the threads.
+    def _share_out(self, samples: _Samples, jobs: Sequence[_Job]) -> None:
+        """Add what the kernels find for all sequences, shared out among the threads."""
+        size = len(samples.states[0])
+        share = max(1, math.ceil(size / self._threads))
 
-        Args:
-            calls: Kernels, with the modes that the states are compared with.
-            states: The samples, and maybe where visibility and matches are found.
-            result: What the costs are added to.
-        """
-        size = len(states[0])
-        if self._threads < 2 or size < 2:
-            for packed, mode in calls:
-                packed.add(states, mode, result)
-            return
+        def add(begin: int) -> None:
+            for job in jobs:
+                job.add(samples, begin, begin + share)
 
-        def add(rows: slice) -> None:
-            part, some = Result(*(each[rows] for each in result)), [x[rows] for x in states]
-            for packed, mode in calls:
-                packed.add(some, None if mode is None else mode[rows], part)
-
-        process = os.getpid()
-        if process not in self._helpers:
-            self._helpers[process] = ThreadPoolExecutor(self._threads - 1)
-        share = math.ceil(size / self._threads)
-        others = [slice(i, i + share) for i in range(share, size, share)]
-        helped = [self._helpers[process].submit(add, rows) for rows in others]
-        add(slice(share))
-        for each in helped:
-            each.result()
+        if share < size:
+            process = os.getpid()
+            if process not in self._helpers:
+                self._helpers[process] = ThreadPoolExecutor(self._threads - 1)
+            helpers = self._helpers[process]
+            helped = [helpers.submit(add, begin) for begin in range(share, size, share)]
+            add(0)
+            for each in helped:
+                each.result()
+        else:
+            add(0)
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
         return self._priors.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
@@ -443,6 +479,30 @@ class FusedEngine:
 
     def _precision(self, name: str) -> Any:
         return np.float64 if name == "keypoints" else self.real
+
+
+def _by_sequence(cost: TrackingCost, states: Sequence[Array]) -> tuple[Array | None, list[int]]:
+    """The order of samples sequence by sequence, and where each sequence ends in it.
+
+    Samples that are not finite are left out of it. None: they are in that order.
+    """
+    sane = np.stack([np.isfinite(each).all(1) for each in states]).all(0)
+    order = None if sane.all() else np.flatnonzero(sane)
+    if cost.sequence is None:
+        return order, [int(sane.sum())]
+    numbers = cost.sequence.numpy()
+    if order is not None or (numbers[1:] < numbers[:-1]).any():
+        order = np.flatnonzero(sane)
+        order = order[numbers[order].argsort(kind="stable")]
+        numbers = numbers[order]
+    return order, numbers.searchsorted([past.sequence for past in cost.past], "right").tolist()
+
+
+def _zeros(shape: tuple[int, ...], slopes: bool) -> Result:
+    """Costs of states of a shape to be added to, with derivatives or without."""
+    size, n = shape
+    width = n if slopes else 0
+    return Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
 
 
 def _is_exact(cost: TrackingCost) -> bool:
