@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 import torch
+from made_robots import write_arm
 
+from torchcss.body.load import load_body
 from torchcss.cost.context import FrameContext
 from torchcss.cost.joints import SPREAD
 from torchcss.cost.total import TrackingCost
@@ -15,6 +20,7 @@ from torchcss.initialise.options import InitialiseOptions
 from torchcss.initialise.result import spread_to, with_lengths
 from torchcss.studies.random_person import RandomPerson, random_person
 from torchcss.types import Keypoints
+from torchcss.vision.camera import Camera
 
 
 def seen(noise_px: float, seed: int) -> tuple[RandomPerson, Keypoints]:
@@ -105,3 +111,24 @@ def test_marks_that_miss_every_pose_by_more_than_their_stated_noise(
     lines = [line for line in found.report if "misses them by more than 3 times" in line]
     assert bool(lines) == told
     assert found.noise == 1.0
+
+
+def test_a_first_look_that_misses_the_best_fit_does_not_decide(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Exact marks are exact, even where the first fit to them is a wrong one."""
+    path = str(write_arm(tmp_path / "arm.urdf"))
+    body, camera = load_body(path), Camera.pinhole(640, 480, focal_px=600.0)
+    x = body.bounds.project(torch.tensor([[-0.29, 1.57, 1.89, -2.0, 2.9, -1.79, -0.71]]).double())
+    side, along, up = body.pose(x).joints[0].unbind(-1)
+    points = torch.stack([side, up, 2.5 - along], dim=-1)
+    marks = Keypoints(camera.project(points)[0], torch.ones(len(points)), body.joint_names)
+
+    def hardly(search: StartSearch) -> StartSearch:
+        few = replace(search, num_starts=1, num_flips=0, num_samples=0, max_steps=1)
+        return replace(few, turn=False, anneal=False)
+
+    monkeypatch.setitem(initialise.__globals__, "briefly", hardly)
+    fit = initialise(None, marks, camera, path, generator=torch.Generator().manual_seed(0))
+    assert float(fit.cost[0]) < 0.1
+    assert fit.noise < 0.5

@@ -83,6 +83,10 @@ alone; beside colours by 0.72 at full weight, 0.77 at a quarter, and 0.78 withou
 _POOR_FIT = 3.0
 """How many times as noisy as expected keypoints are where the user is told."""
 
+_MISSED = 0.5
+"""Share of the noise that was learnt before, below which the search starts anew: the fit before was
+not the best."""
+
 _NO_POSE = (
     "they fit no pose before this camera well; look at the first frame's keypoints, or start at "
     "another frame"
@@ -144,13 +148,14 @@ def initialise(
             brief = replace(options, search=briefly(options.search))
             rough = fit_joints(body, view, generator=generator, options=brief, others=others)
             noise = _noise(rough, view, others, options)
-            options = replace(options, sigma=noise * sigma)
-            what = "a wrist" if {"l_wrist", "r_wrist"} & {*rough.body.joint_names} else "a joint"
-            line = f"keypoints: noise of {what} {noise * sigma:.1f} px, from the best fit"
-            if noise > _POOR_FIT:
-                line += f", {noise:.1f} times what detectors have: {_NO_POSE}"
-            notes.append(line)
-        first, options = _fit_of_size(body, view, generator, options, others)
+        told = replace(options, sigma=noise * sigma)
+        first, known = _fit_of_size(body, view, generator, told, others)
+        if learns:
+            while (found := _noise(first, view, others, options)) < _MISSED * noise:
+                noise, told = found, replace(options, sigma=found * sigma)
+                first, known = _fit_of_size(body, view, generator, told, others)
+            notes.append(_noise_line(first.body, noise, sigma))
+        options = known
         first = first._replace(noise=noise)
         given = keypoints.only(first.body.joint_names).to(first.body.tie)
         alone = options.joint_cost(first.body, [view._replace(keypoints=given)])
@@ -161,6 +166,15 @@ def initialise(
         if image is None or not options.contours or isinstance(body, BodyModel):
             return first
         return _to_the_picture(first, image, view._replace(keypoints=given), others, options)
+
+
+def _noise_line(body: BodyModel, noise: float, sigma: float) -> str:
+    """What to say of the noise that was learnt, as a multiple of what was expected, pixels."""
+    what = "a wrist" if {"l_wrist", "r_wrist"} & {*body.joint_names} else "a joint"
+    line = f"keypoints: noise of {what} {noise * sigma:.1f} px, from the best fit"
+    if noise <= _POOR_FIT:
+        return line
+    return f"{line}, {noise:.1f} times what detectors have: {_NO_POSE}"
 
 
 def _misses(alone: TrackingCost, x: Vector) -> str | None:
