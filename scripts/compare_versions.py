@@ -186,7 +186,7 @@ def clips(config: Config) -> dict[str, list[str]]:
     ]
     found = {"arm": [*arm, *end]}
     if config.data is not None:
-        folder = config.data / "balance_beam_4cam"
+        folder = config.data.resolve() / "balance_beam_4cam"
         beam = [
             *(str(folder / "cam01.mp4"), "--keypoints", str(folder / "keypoints2d_cam01.npz")),
             *("--camera", str(folder / "cameras.json"), "--camera-name", "cam01"),

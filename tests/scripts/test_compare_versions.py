@@ -120,11 +120,15 @@ def test_a_version_that_is_none_is_told(script: ModuleType, tmp_path: Path) -> N
         script.main(script.Config(against="v99", environments=tmp_path))
 
 
-def test_what_is_tracked(script: ModuleType, tmp_path: Path) -> None:
+def test_what_is_tracked(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     assert list(script.clips(script.Config(against="v0.1"))) == ["arm"]
-    found = script.clips(script.Config(against="v0.1", data=tmp_path, frames=7))
+    monkeypatch.chdir(tmp_path)  # the versions run in folders of their own
+    found = script.clips(script.Config(against="v0.1", data=Path(), frames=7))
     assert list(found) == ["arm", "beam", "beam, first"]
     assert all(words[words.index("--stop") + 1] == "7" for words in found.values())
+    assert found["beam"][0] == str(tmp_path / "balance_beam_4cam" / "cam01.mp4")
 
 
 def test_numbers_of_samples(script: ModuleType, tmp_path: Path) -> None:
