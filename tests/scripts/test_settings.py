@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import made_robots
+import numpy as np
 import pytest
 import tyro
 from made_sequences import write_arm
@@ -42,6 +43,7 @@ VARIED = {
     "learn_weights": {"body", "weights"},
     "long_run": {"body"},
     "model_variations": {"body", "preset"},
+    "predictive_power": {"likelihood_power"},
     "printed_and_ours": {"body", "preset"},
     "profile_frame": set(),
     "several_views": set(),
@@ -71,6 +73,12 @@ def arguments(folder: Path, script: str) -> list[str]:
     if script in ("ablation", "evaluate_posterior"):
         for name in ("video.mp4", "cameras.json", "keypoints2d.npz", "reference3d.npz"):
             (folder / name).touch()
+        return ["--data", str(folder), "--runs", str(folder / "runs")]
+    if script == "predictive_power":
+        for name in ("video.mp4", "cameras.json", "reference3d.npz"):
+            (folder / name).touch()
+        arrays = {"confidence": np.ones((1, 1)), "keypoints": np.ones((1, 1, 2))}
+        np.savez(folder / "keypoints2d.npz", joint_names=["l_wrist"], **arrays)
         return ["--data", str(folder), "--runs", str(folder / "runs")]
     if script == "track_robot":
         urdf = made_robots.write_arm(folder / "seven.urdf")
@@ -127,6 +135,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Settings]:
                 "ablation",
                 "several_views",
                 "evaluate_posterior",
+                "predictive_power",
                 "profile_frame",
                 "long_run",
             ):  # whose films are none, or whose body has a size that these settings would change
