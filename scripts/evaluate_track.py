@@ -96,7 +96,7 @@ def evaluation(run: Run, config: Config) -> Evaluation:
 
 def detector_alone(run: Run) -> Run | None:
     """The run with the joints in space that its detector believes in; None: it says none."""
-    if not run.cameras or (files := run.cameras[0].files) is None or not files.video.exists():
+    if (files := run.track.first_files) is None or not files.video.exists():
         return None
     links = {} if run.track.body is None else run.body.joint_of_name
     keypoints = open_view(files, run.camera, None, links).keypoints

@@ -218,7 +218,7 @@ def _with_images(run: Run, choice: Smoothing) -> SmoothedTrack:
     track, settings = run.track, run_settings(run)
     if not len(track.frames):
         raise TrackFileError(f"{run.path}: the track has no frames, of which images could show any")
-    files = run.cameras[0].files if run.cameras else None
+    files = track.first_files
     known = {
         "--camera": bool(run.cameras),
         "--video": files is not None,

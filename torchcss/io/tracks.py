@@ -48,9 +48,9 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from torchcss.body.bases import on_origin
+from torchcss.body.bases import on_origin, pose_track
 from torchcss.body.model import BodyModel
-from torchcss.body.uncertainty import Held
+from torchcss.body.uncertainty import Held, joint_covariance
 from torchcss.errors import ShapeError, TrackFileError
 from torchcss.files import (
     StrPath,
@@ -63,7 +63,8 @@ from torchcss.files import (
     write_text,
 )
 from torchcss.io.track_body import body_from_plain, body_to_plain
-from torchcss.io.view_files import RecordedCamera, camera_from_plain, camera_to_plain
+from torchcss.io.view_files import RecordedCamera, ViewFiles, camera_from_plain, camera_to_plain
+from torchcss.vision.camera import Camera
 
 TRACK_VERSION = 2
 TRACK_NAME = "track.npz"
@@ -181,6 +182,16 @@ class Track(NamedTuple):
         return (self.log_weight > -np.inf).sum(axis=1)
 
     @property
+    def first_camera(self) -> Camera | None:
+        """The first camera; None where the file does not say."""
+        return self.cameras[0].camera if self.cameras else None
+
+    @property
+    def first_files(self) -> ViewFiles | None:
+        """What the first camera recorded; None where that is not known."""
+        return self.cameras[0].files if self.cameras else None
+
+    @property
     def held(self) -> Held | None:
         """What the covariances hold for known and is not; None: all is, or the file has no camera.
 
@@ -192,6 +203,21 @@ class Track(NamedTuple):
         if not (self.size_deviation or focal):
             return None
         return Held(self.size_deviation, focal, camera.centre_world, camera.R_camera_world[2])
+
+    def best_covariances(
+        self, body: BodyModel, about: Sequence[int] = ()
+    ) -> Float[np.ndarray, "t j 3 3"]:
+        """Covariances of the joint centres of the best modes, square metres.
+
+        Args:
+            body: The body that was tracked, on the origin.
+            about: See `torchcss.body.uncertainty.joint_covariance`.
+        """
+        state, base, covariance = map(
+            torch.from_numpy, (self.state[:, 0], self.base_transform, self.covariance[:, 0])
+        )
+        pose = pose_track(body, state, base)
+        return joint_covariance(body, pose, covariance, about=about, held=self.held).numpy()
 
     def first(self, num_frames: int) -> Track:
         """The same track up to a frame, as when no more had been tracked."""

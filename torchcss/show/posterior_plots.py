@@ -19,15 +19,12 @@ import math
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchcss.body.bases import pose_track
 from torchcss.body.root import ROOT_NAMES, has_root
-from torchcss.body.uncertainty import joint_covariance
 from torchcss.files import prepare_output_folder
 from torchcss.io.run import Run, body_of_track
 from torchcss.io.tracks import TRACK_NAME, Track
@@ -91,7 +88,7 @@ def plot_track(
     check_not_empty(track)
     usual = "plots" if run.path.name == TRACK_NAME else f"{run.path.stem}_plots"
     out = prepare_output_folder(run.folder / usual if out is None else out)
-    camera = run.cameras[0].camera if run.cameras else None
+    camera = track.first_camera
     if frame is None:
         frame = most_open_frame(track)
     figures = {
@@ -125,12 +122,7 @@ def joints_figure(track: Track, *, camera: Camera | None = None) -> Figure:
     check_not_empty(track)
     names = [n for n in SHOWN_JOINTS if n in track.joint_names] or list(track.joint_names)
     chosen = [track.joint_names.index(name) for name in names]
-    body = body_of_track(track)
-    state, base, covariance = map(
-        torch.from_numpy, (track.state[:, 0], track.base_transform, track.covariance[:, 0])
-    )
-    pose = pose_track(body, state, base)
-    spread = joint_covariance(body, pose, covariance, held=track.held).numpy()
+    spread = track.best_covariances(body_of_track(track))
     places, labels = track.joints_world, ("world x", "world y", "world z")
     if camera is not None:
         # Up is minus the camera's y.

@@ -89,7 +89,6 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
     """
     track = run.track._replace(body=run.body)
     check_not_empty(track)
-    camera = run.cameras[0].camera if run.cameras else None
     sections = (
         ("Film", _film(run, anew=anew)),
         (
@@ -97,7 +96,7 @@ def write_report_page(run: Run, *, anew: bool = False) -> Path:
             "<p>The frame whose weight is spread over most modes. Where the lines part, one camera "
             "cannot tell which pose it was.</p>"
             + _image(
-                side_view_figure(track, most_open_frame(track), camera=camera),
+                side_view_figure(track, most_open_frame(track), camera=track.first_camera),
                 "the modes from the side",
             ),
         ),
@@ -202,7 +201,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     """What was tracked how, as far as the run says."""
     track, summary, settings = run.track, run.summary, run.settings
     span = f"{track.frames[0]} to {track.frames[-1]}, {track.times[-1] - track.times[0]:.2f} s"
-    files = run.cameras[0].files if run.cameras else None
+    files = track.first_files
     facts = [
         ("Video", str(files.video) if files else "not known"),
         (
@@ -284,7 +283,7 @@ def _descents(run: Run) -> str:
 
 def _keypoints(run: Run) -> str:
     """Where the keypoints are from, and whether they counted in all frames."""
-    files = run.cameras[0].files if run.cameras else None
+    files = run.track.first_files
     if not (files and files.keypoints):
         return "not known"
     only = ", in the first frame alone" if _option(run, "keypoints_use") == "first" else ""

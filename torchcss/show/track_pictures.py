@@ -75,8 +75,8 @@ def write_overlays(run: Run, frame_rate: float) -> list[Path]:
 
 def known_video(run: Run) -> Path | None:
     """The first camera's video, if the run knows it and it is still there."""
-    video = run.cameras[0].files.video if run.cameras and run.cameras[0].files else None
-    return video if video is not None and video.exists() else None
+    files = run.track.first_files
+    return files.video if files is not None and files.video.exists() else None
 
 
 def overlay_of(run: Run) -> tuple[Path, int]:

@@ -108,7 +108,7 @@ def view_track(
             if the recording cannot be written.
     """
     check_not_empty(run.track)
-    track, camera = run.track, run.cameras[0].camera if run.cameras else None
+    track, camera = run.track, run.track.first_camera
     best = track.joints_world[:, 0]
     up, _ = up_axis(track.joint_names, best, track.base_transform, camera_up(camera))
     events = bool(run.summary.get("events"))

@@ -38,7 +38,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from torchcss.body.bases import pose_track
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, has_root
 from torchcss.body.uncertainty import joint_covariance
@@ -698,18 +697,12 @@ def reference_deviation(path: StrPath) -> float:
 
 
 def _stated(
-    track: Track, joints: Sequence[int], roots: Sequence[int], turn: Float[np.ndarray, "3 3"]
+    track: Track, joints: list[int], roots: list[int], turn: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "t j 3 3"] | None:
     """Covariances of joints of the best modes, from the roots and turned; None without a body."""
     if track.body is None:
         return None
-    state, base, spread = (
-        torch.from_numpy(part)
-        for part in (track.state[:, 0], track.base_transform, track.covariance[:, 0])
-    )
-    pose = pose_track(track.body, state, base)
-    found = joint_covariance(track.body, pose, spread, about=roots, held=track.held)
-    return turn @ found[:, list(joints)].numpy() @ turn.T
+    return turn @ track.best_covariances(track.body, roots)[:, joints] @ turn.T
 
 
 def _turn(

@@ -250,7 +250,7 @@ def _frame_of_file(
     """The file's frame from the world's, and a standing body's orientation in it."""
     axis = world_up
     if world_up == "auto":
-        picture_up = camera_up(track.cameras[0].camera if track.cameras else None)
+        picture_up = camera_up(track.first_camera)
         # Of all frames, also those that are left out: parts of one track stand in one frame.
         axis, agreement = up_axis(
             track.joint_names, track.joints_world[:, 0], track.base_transform, picture_up
@@ -327,7 +327,7 @@ def _rate(track: Track, kept: np.ndarray, report: list[str]) -> float:
 
 def _rate_of_video(track: Track) -> float | None:
     """Frames per second of the first camera's video; None where there is none any more."""
-    files = track.cameras[0].files if track.cameras else None
+    files = track.first_files
     if files is None:
         return None
     with suppress(VideoError):
