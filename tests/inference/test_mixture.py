@@ -1,5 +1,4 @@
 import math
-from unittest.mock import patch
 
 import pytest
 import torch
@@ -18,7 +17,6 @@ from torchcss.inference.mixture import (
     separated,
     tempered,
 )
-from torchcss.kernels import compiler
 
 
 def random_mixture(
@@ -207,15 +205,13 @@ def separated_one_by_one(landmarks: torch.Tensor, distance: float, num: int) -> 
     num=st.integers(1, 14),
     distance=st.sampled_from([0.0, 0.5, 1.5, 4.0, 100.0]),
     single_precision=st.booleans(),
-    compiled=st.booleans(),
     seed=st.integers(0, 2**31),
 )
-def test_separated_is_its_definition(k, points, num, distance, single_precision, compiled, seed):
+def test_separated_is_its_definition(k, points, num, distance, single_precision, seed):
     drawn = torch.Generator().manual_seed(seed)
     dtype = torch.float32 if single_precision else torch.float64
     landmarks = 2 * torch.randn(k, points, 3, generator=drawn, dtype=dtype)
-    with patch.object(compiler, "COMPILED", compiled and compiler.COMPILED):
-        chosen = separated(landmarks, distance, num)
+    chosen = separated(landmarks, distance, num)
     assert chosen.dtype == torch.long
     assert chosen.tolist() == separated_one_by_one(landmarks, distance, num)
     assert len(chosen) == min(k, num)

@@ -15,6 +15,7 @@ found before (step 2.3; `torchcss.studies.minima` counts them more strictly), `m
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +24,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchcss.errors import ShapeError
-from torchcss.kernels import compiler
-from torchcss.kernels.checked import run
 from torchcss.linalg import (
     covariance_factor,
     log_determinant,
@@ -39,7 +38,7 @@ from torchcss.linalg import (
 from torchcss.types import Items, Matrices, Numbers, Vector, Vectors
 
 _MODES_AT_ONCE = 32
-"""Modes whose distances from all that cost more are found together; most of them are kept."""
+"""Modes whose distances from all that are worse are found together; most of them are kept."""
 
 _STATES_AT_ONCE = 1024
 """States whose differences from all components are held in memory together."""
@@ -261,24 +260,39 @@ def distinct_modes(
     Returns:
         Indices of the modes kept, by ascending cost.
     """
-    order, kept = cheapest_first(cost), []
-    room = len(cost) if most is None else most
-    while len(order) and room:
+
+    def is_far(some: Items, others: Items) -> Tensor:
+        apart = mean[others] - mean[some, None]
+        return squared_lengths(apart, with_least_width(covariance[some])) > distance**2
+
+    return _unlike_better(cheapest_first(cost), is_far, len(cost) if most is None else most)
+
+
+def _unlike_better(
+    order: Items, is_far: Callable[[Items, Items], Bool[Tensor, "b m"]], most: int
+) -> Items:
+    """Choose modes in their order, each far from all that were chosen before.
+
+    Args:
+        order: The modes, the best first.
+        is_far: Tells of some modes which of others are far from each of them.
+        most: Choose so many at most.
+    """
+    kept = [order[:0]]
+    while len(order) and most:
         block = order[:_MODES_AT_ONCE]
-        apart = mean[order] - mean[block, None]
-        far = squared_lengths(apart, with_least_width(covariance[block])) > distance**2
-        far = far.cpu().numpy()  # one transfer for all of the block
+        far = is_far(block, order).cpu().numpy()  # one transfer for all of the block
         left, own = np.ones(len(order), dtype=bool), []
         for place, others in enumerate(far):
-            if left[place] and len(own) < room:
+            if left[place] and len(own) < most:
                 own.append(place)
                 left &= others
-        room -= len(own)
+        most -= len(own)
         later = len(block) + np.flatnonzero(left[len(block) :])
         chosen, later = (torch.tensor(places, device=order.device) for places in (own, later))
         kept.append(block[chosen])
         order = order[later]
-    return torch.cat(kept) if kept else order[:0]
+    return torch.cat(kept)
 
 
 def tempered(covariance: Matrices, power: float, prior_variance: Vector) -> Matrices:
@@ -318,31 +332,19 @@ def separated(
     Returns:
         Indices of the modes, in the order given.
     """
-    taken = _taken(landmarks, distance, num)
+    places = landmarks.transpose(0, 1)  # of one landmark in all modes
+
+    def is_far(some: Items, others: Items) -> Tensor:
+        # By differences: products would lose what is small.
+        mode = "donot_use_mm_for_euclid_dist"
+        return torch.cdist(places[:, some], places[:, others], 2.0, mode).amax(0) >= distance
+
+    every = torch.arange(len(landmarks), device=landmarks.device)
+    chosen = _unlike_better(every, is_far, num)
     if not fill:
-        return taken.nonzero()[:, 0]
-    chosen = taken.nonzero()[:, 0]
-    alike = (~taken).nonzero()[: num - len(chosen), 0]
+        return chosen
+    alike = every[torch.isin(every, chosen, invert=True)][: num - len(chosen)]
     return torch.cat([chosen, alike]).sort().values
-
-
-def _taken(landmarks: Float[Tensor, "k m d"], distance: float, num: int) -> Bool[Tensor, " k"]:
-    """Which modes are taken in their order, each unlike those taken before."""
-    taken = torch.zeros(len(landmarks), dtype=torch.bool, device=landmarks.device)
-    left = torch.ones_like(taken)
-    if compiler.COMPILED and landmarks.device.type == "cpu" and not torch.compiler.is_compiling():
-        from torchcss.inference.separation_kernels import separate  # compiled: where it is used
-
-        run(separate, landmarks.detach(), distance, num, taken, left)
-        return taken
-    for _ in range(min(num, len(landmarks))):
-        # One number in a transfer: the best that is left, or none.
-        best = int(torch.where(left.any(), left.int().argmax(), -1))
-        if best < 0:
-            break
-        taken[best], left[best] = True, False
-        left &= (landmarks - landmarks[best]).norm(dim=-1).amax(-1) >= distance
-    return taken
 
 
 def representatives(
