@@ -1,8 +1,8 @@
 """The text of a BVH file: the segments of its skeleton, and the numbers that move them.
 
-What is not as it should be ends in a `MotionCaptureError` that names file and line: a damaged file
-never yields a motion. `torchcss.body.files.bvh` makes a body of what is parsed here, and
-`torchcss.io.motion.positions` positions.
+What is not as it should be ends in a `MotionCaptureError` that names the line, before which callers
+put the file: a damaged file never yields a motion. `torchcss.body.files.bvh` makes a body of what
+is parsed here, and `torchcss.io.motion.positions` positions.
 
 Call `parse_bvh`.
 """
@@ -63,28 +63,28 @@ _HUGE = 1e12
 """No length or angle of a body is so large, in any unit."""
 
 
-def bad(path: Path, line: int, expected: str, found: object) -> MotionCaptureError:
+def bad(line: int, expected: str, found: object) -> MotionCaptureError:
     """The error for a line that is not as it should be."""
     return MotionCaptureError(
-        f"{path}: line {line}: expected {expected}, found {shortened(found)}; get a complete copy"
+        f"line {line}: expected {expected}, found {shortened(found)}; get a complete copy"
     )
 
 
-def finite_numbers(path: Path, line: int, words: Sequence[str], expected: str) -> list[float]:
+def finite_numbers(line: int, words: Sequence[str], expected: str) -> list[float]:
     """Finite numbers, as any program writes them: with a decimal comma, but not as 1_000."""
     try:
         values = [math.nan if "_" in word else float(word.replace(",", ".")) for word in words]
     except ValueError:
         values = [math.nan]
     if not all(abs(value) < _HUGE for value in values):
-        raise bad(path, line, expected, " ".join(words))
+        raise bad(line, expected, " ".join(words))
     return values
 
 
-def whole_number(path: Path, line: int, word: str, expected: str) -> int:
+def whole_number(line: int, word: str, expected: str) -> int:
     """A whole number of few digits: the interpreter refuses thousands of them in its own way."""
     if not re.fullmatch(r"[0-9]{1,9}", word):
-        raise bad(path, line, expected, word)
+        raise bad(line, expected, word)
     return int(word)
 
 
@@ -99,8 +99,7 @@ def axis_of(letter: str) -> int:
 class _Words:
     """The words of a hierarchy, one after the other."""
 
-    def __init__(self, path: Path, lines: Sequence[Line]) -> None:
-        self.path = path
+    def __init__(self, lines: Sequence[Line]) -> None:
         self.words = [(line.number, word) for line in lines for word in line.words]
         self.next = 0
 
@@ -109,14 +108,9 @@ class _Words:
         """Line of the next word, or of the last one."""
         return self.words[min(self.next, len(self.words) - 1)][0]
 
-    @property
-    def at_end(self) -> bool:
-        """Whether all words are taken."""
-        return self.next >= len(self.words)
-
     def take(self, expected: str) -> str:
         if self.next >= len(self.words):
-            raise bad(self.path, self.line, expected, "the end of the file")
+            raise bad(self.line, expected, "the end of the file")
         self.next += 1
         return self.words[self.next - 1][1]
 
@@ -124,7 +118,7 @@ class _Words:
         line = self.line
         word = self.take(" or ".join(wanted))
         if word.upper() not in wanted:
-            raise bad(self.path, line, " or ".join(wanted), word)
+            raise bad(line, " or ".join(wanted), word)
         return word.upper()
 
     def name(self) -> str:
@@ -133,14 +127,14 @@ class _Words:
         while (word := self.take("a name and {")) != "{":
             words.append(word)
         if not words:
-            raise bad(self.path, line, "a name", "{")
+            raise bad(line, "a name", "{")
         return " ".join(words)
 
     def offset(self) -> tuple[float, float, float]:
         self.keyword("OFFSET")
         line = self.line
         words = [self.take("three numbers") for _ in range(3)]
-        x, y, z = finite_numbers(self.path, line, words, "three numbers")
+        x, y, z = finite_numbers(line, words, "three numbers")
         return x, y, z
 
 
@@ -157,10 +151,10 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
     """
     lines = read_lines(path, MotionCaptureError)
     if lines[0].words[0].upper() != "HIERARCHY":
-        raise bad(path, lines[0].number, "HIERARCHY, as every BVH begins", lines[0].words[0])
+        raise bad(lines[0].number, "HIERARCHY, as every BVH begins", lines[0].words[0])
     firsts = [line.words[0].upper() for line in lines]
     motion = firsts.index("MOTION") if "MOTION" in firsts else len(lines) - 1
-    words = _Words(path, lines[: motion + 1])
+    words = _Words(lines[: motion + 1])
     words.keyword("HIERARCHY")
     segments: list[Segment] = []
     names: set[str] = set()
@@ -169,12 +163,12 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
     allowed: tuple[str, ...] = ("ROOT",)
     while True:
         line = words.line
-        if allowed == ("MOTION",) and words.at_end:
+        if allowed == ("MOTION",) and words.next == len(words.words):
             return segments, np.zeros((0, len(columns))), _DEFAULT_RATE
         kind = words.keyword(*allowed, *(("ROOT",) if segments else ()))
         if kind == "ROOT" and segments:
             raise MotionCaptureError(
-                f"{path}: line {line}: a second ROOT; save every skeleton in a file of its own"
+                f"line {line}: a second ROOT; save every skeleton in a file of its own"
             )
         if kind == "MOTION":
             break
@@ -193,7 +187,7 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
             continue
         name = words.name()
         if name in names:
-            raise bad(path, line, "a name of its own for every joint", name)
+            raise bad(line, "a name of its own for every joint", name)
         names.add(name)
         offset = words.offset()
         turns = _channels(words, len(columns))
@@ -202,8 +196,8 @@ def parse_bvh(path: Path) -> tuple[list[Segment], Float[np.ndarray, "t c"], floa
         stack.append(len(segments) - 1)
         allowed = ("JOINT", "END", "}")
     if (number := len(segments)) > MOST_LINKS:
-        raise MotionCaptureError(f"{path}: {number:,} links; expected {MOST_LINKS:,} at most")
-    return segments, *_bvh_frames(path, lines[motion:], np.array(columns, dtype=bool))
+        raise MotionCaptureError(f"{number:,} links; expected {MOST_LINKS:,} at most")
+    return segments, *_bvh_frames(lines[motion:], np.array(columns, dtype=bool))
 
 
 def without_empty_positions(
@@ -234,54 +228,49 @@ def without_empty_positions(
 def _channels(words: _Words, first_column: int) -> tuple[Channel, ...]:
     words.keyword("CHANNELS")
     line = words.line
-    number = whole_number(
-        words.path, line, words.take("a number of channels"), "a number of channels"
-    )
+    expected = "a number of channels"
+    number = whole_number(line, words.take(expected), expected)
     turns: list[Channel] = []
     for column in range(first_column, first_column + min(number, 7)):
         word = words.take("a channel")
         match = _CHANNEL.fullmatch(word)
         if match is None:
-            raise bad(words.path, line, "Xposition, ..., Zrotation", word)
+            raise bad(line, "Xposition, ..., Zrotation", word)
         turn = Channel(column, axis_of(match[1]), match[2].lower() == "rotation")
         if any(turn[1:] == other[1:] for other in turns):
-            raise bad(words.path, line, "every channel once", word)
+            raise bad(line, "every channel once", word)
         turns.append(turn)
     return tuple(turns)
 
 
-def _bvh_frames(
-    path: Path, lines: list[Line], is_angle: np.ndarray
-) -> tuple[Float[np.ndarray, "t c"], float]:
+def _bvh_frames(lines: list[Line], is_angle: np.ndarray) -> tuple[Float[np.ndarray, "t c"], float]:
     """From MOTION on: the rows of numbers, angles in radians, and the frame rate."""
     if len(lines) < 2:
-        raise bad(path, lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
-    number = whole_number(
-        path, lines[1].number, _said(path, lines[1], "Frames"), "a number of frames"
-    )
+        raise bad(lines[0].number, "Frames: and Frame Time: after it", "the end of the file")
+    number = whole_number(lines[1].number, _said(lines[1], "Frames"), "a number of frames")
     if number == 0 and len(lines) == 2:
-        return _table(path, [], is_angle), _DEFAULT_RATE
+        return _table([], is_angle), _DEFAULT_RATE
     if len(lines) < 3:
-        raise bad(path, lines[1].number, "Frame Time: after it", "the end of the file")
+        raise bad(lines[1].number, "Frame Time: after it", "the end of the file")
     second, rows = lines[2], lines[3:]
-    digits = _said(path, second, "Frame Time").replace(",", ".")
-    (interval,) = finite_numbers(path, second.number, [digits], "the seconds of a frame")
+    digits = _said(second, "Frame Time").replace(",", ".")
+    (interval,) = finite_numbers(second.number, [digits], "the seconds of a frame")
     if interval == 0 and number < 2:
         interval = 1 / _DEFAULT_RATE
     if not 1e-6 < interval < 1e3:
-        raise bad(path, second.number, "the seconds of a frame", digits)
+        raise bad(second.number, "the seconds of a frame", digits)
     if number != len(rows):
         found = f"{len(rows)} lines of numbers"
-        raise bad(path, lines[-1].number, f"{number} frames, as Frames: says", found)
-    return _table(path, rows, is_angle), _rate(interval, digits)
+        raise bad(lines[-1].number, f"{number} frames, as Frames: says", found)
+    return _table(rows, is_angle), _rate(interval, digits)
 
 
-def _said(path: Path, line: Line, title: str) -> str:
+def _said(line: Line, title: str) -> str:
     """What stands after a title and a colon."""
     text = " ".join(line.words)
     found, colon, value = text.partition(":")
     if not colon or found.strip().lower() != title.lower():
-        raise bad(path, line.number, f"{title}: and a number", text)
+        raise bad(line.number, f"{title}: and a number", text)
     return value.strip()
 
 
@@ -295,11 +284,11 @@ def _rate(interval: float, digits: str) -> float:
     return 1 / interval
 
 
-def _table(path: Path, rows: Sequence[Line], is_angle: np.ndarray) -> np.ndarray:
+def _table(rows: Sequence[Line], is_angle: np.ndarray) -> np.ndarray:
     """Rows of numbers, angles from degrees to radians."""
     values = np.empty((len(rows), len(is_angle)))
     for out, (line, words) in zip(values, rows, strict=True):
         if len(words) != len(is_angle):
-            raise bad(path, line, f"{len(is_angle)} numbers, one for every channel", len(words))
-        out[:] = finite_numbers(path, line, words, "numbers")
+            raise bad(line, f"{len(is_angle)} numbers, one for every channel", len(words))
+        out[:] = finite_numbers(line, words, "numbers")
     return np.where(is_angle, np.radians(values), values)

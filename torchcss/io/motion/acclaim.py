@@ -25,7 +25,7 @@ from torchcss.body.files.bvh_parser import (
 )
 from torchcss.body.rotations import about_fixed_axes
 from torchcss.errors import MotionCaptureError
-from torchcss.files import Line, read_lines
+from torchcss.files import Line, naming, read_lines
 
 
 class _Acclaim(NamedTuple):
@@ -64,25 +64,27 @@ def parse_acclaim(
     Raises:
         MotionCaptureError: For any bad file.
     """
-    found = _parse_asf(skeleton, read_lines(skeleton, MotionCaptureError))
-    values = _parse_amc(motion, read_lines(motion, MotionCaptureError), found)
+    with naming(skeleton, MotionCaptureError):
+        found = _parse_asf(read_lines(skeleton, MotionCaptureError))
+    with naming(motion, MotionCaptureError):
+        values = _parse_amc(read_lines(motion, MotionCaptureError), found)
     return found.segments, values, found.metres_per_unit
 
 
-def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
+def _parse_asf(lines: list[Line]) -> _Acclaim:
     sections = _sections(lines)
     for name in (":root", ":bonedata", ":hierarchy"):
         if name not in sections:
-            raise bad(path, lines[-1].number, f"a section {name}", ", ".join(sections) or "none")
-    radians, metres = _units(path, sections[":units"][1] if ":units" in sections else [])
-    bones = _bones(path, sections[":bonedata"][1], radians)
+            raise bad(lines[-1].number, f"a section {name}", ", ".join(sections) or "none")
+    radians, metres = _units(sections[":units"][1] if ":units" in sections else [])
+    bones = _bones(sections[":bonedata"][1], radians)
     root = _entries(sections[":root"][1])
-    parents = _hierarchy(path, sections[":hierarchy"], set(bones))
+    parents = _hierarchy(sections[":hierarchy"], set(bones))
     if "order" not in root:
-        raise bad(path, sections[":root"][0].number, "an order in :root", "none")
+        raise bad(sections[":root"][0].number, "an order in :root", "none")
 
     def vector(key: str) -> tuple[float, float, float]:
-        return _vector(path, root[key], "three numbers") if key in root else (0.0, 0.0, 0.0)
+        return _vector(root[key]) if key in root else (0.0, 0.0, 0.0)
 
     order, axes = root["order"], _turned(vector("orientation"), "XYZ", radians)
     bones["root"] = _Bone(order.number, vector("position"), axes, tuple(order.words[1:]))
@@ -92,7 +94,7 @@ def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
     segments: list[Segment] = []
     for name in index:
         bone = bones[name]
-        turns = _turns(path, bone, len(is_angle), may_travel=name == "root")
+        turns = _turns(bone, len(is_angle), may_travel=name == "root")
         is_angle += [turn.is_rotation for turn in turns]
         if turns:
             counts[name] = len(turns)
@@ -102,36 +104,36 @@ def _parse_asf(path: Path, lines: list[Line]) -> _Acclaim:
     return _Acclaim(segments, counts, is_angle, radians, metres)
 
 
-def _turns(path: Path, bone: _Bone, first: int, *, may_travel: bool) -> tuple[Channel, ...]:
+def _turns(bone: _Bone, first: int, *, may_travel: bool) -> tuple[Channel, ...]:
     """What moves a bone, by columns from the first one on."""
     turns = []
     for column, word in enumerate(bone.freedom, first):
         kind, axis = word[:1].lower(), axis_of(word[1:] or "?")
         if len(word) != 2 or axis < 0 or kind not in ("rt" if may_travel else "r"):
-            raise bad(path, bone.line, "degrees of freedom rx, ry, rz", word)
+            raise bad(bone.line, "degrees of freedom rx, ry, rz", word)
         turns.append(Channel(column, axis, kind == "r"))
     if len({turn[1:] for turn in turns}) < len(turns):
-        raise bad(path, bone.line, "every degree of freedom once", " ".join(bone.freedom))
+        raise bad(bone.line, "every degree of freedom once", " ".join(bone.freedom))
     return tuple(turns)
 
 
-def _vector(path: Path, line: Line, expected: str) -> tuple[float, float, float]:
+def _vector(line: Line) -> tuple[float, float, float]:
     """The three numbers of a line."""
-    words = line.words[1:4]
-    values = finite_numbers(path, line.number, words, expected)
+    words, expected = line.words[1:4], "three numbers"
+    values = finite_numbers(line.number, words, expected)
     if len(values) != 3:
-        raise bad(path, line.number, expected, " ".join(words))
+        raise bad(line.number, expected, " ".join(words))
     return values[0], values[1], values[2]
 
 
-def _units(path: Path, lines: Sequence[Line]) -> tuple[bool, float | None]:
+def _units(lines: Sequence[Line]) -> tuple[bool, float | None]:
     """Whether angles are in radians, and the metres per unit of length, where stated."""
     units = _entries(lines)
     radians = "angle" in units and units["angle"].words[-1].lower().startswith("rad")
     if "length" not in units:
         return radians, None
     line = units["length"]
-    fraction, *_ = finite_numbers(path, line.number, line.words[1:2] or ["nothing"], "a length")
+    fraction, *_ = finite_numbers(line.number, line.words[1:2] or ["nothing"], "a length")
     return radians, 0.0254 / fraction if fraction > 1e-9 else None
 
 
@@ -147,7 +149,7 @@ class _Bone(NamedTuple):
     freedom: tuple[str, ...]
 
 
-def _bones(path: Path, lines: Sequence[Line], radians: bool) -> dict[str, _Bone]:
+def _bones(lines: Sequence[Line], radians: bool) -> dict[str, _Bone]:
     bones: dict[str, _Bone] = {}
     block: list[Line] | None = None
     for line in lines:
@@ -155,35 +157,33 @@ def _bones(path: Path, lines: Sequence[Line], radians: bool) -> dict[str, _Bone]
         if word == "begin" and block is None:
             block = [line]
         elif word == "end" and block is not None:
-            name, bone = _bone(path, block, radians)
+            name, bone = _bone(block, radians)
             if name in bones or name == "root":
-                raise bad(path, block[0].number, "a name of its own for every bone", name)
+                raise bad(block[0].number, "a name of its own for every bone", name)
             bones[name] = bone
             block = None
         elif block is not None and word != "begin":
             block.append(line)
         else:
-            raise bad(path, line.number, "begin ... end for every bone", " ".join(line.words))
+            raise bad(line.number, "begin ... end for every bone", " ".join(line.words))
     if block is not None:
-        raise bad(path, block[-1].number, "end of a bone", "the end of the section")
+        raise bad(block[-1].number, "end of a bone", "the end of the section")
     return bones
 
 
-def _bone(path: Path, block: Sequence[Line], radians: bool) -> tuple[str, _Bone]:
+def _bone(block: Sequence[Line], radians: bool) -> tuple[str, _Bone]:
     entries = _entries(block)
     first = block[0].number
     for key, size in (("name", 1), ("direction", 3), ("length", 1), ("axis", 3)):
         if key not in entries or len(entries[key].words) < 1 + size:
-            raise bad(path, first, f"{key} of a bone", ", ".join(entries))
+            raise bad(first, f"{key} of a bone", ", ".join(entries))
 
-    direction = _vector(path, entries["direction"], "3 numbers")
-    axis = _vector(path, entries["axis"], "3 numbers")
-    line = entries["length"]
-    (length,) = finite_numbers(path, line.number, line.words[1:2], "1 numbers")
+    axis, line = _vector(entries["axis"]), entries["length"]
+    (length,) = finite_numbers(line.number, line.words[1:2], "1 numbers")
     order = (entries["axis"].words[4:5] or ["XYZ"])[0].upper()
     if sorted(order) != ["X", "Y", "Z"]:
-        raise bad(path, entries["axis"].number, "an order of X, Y and Z", order)
-    x, y, z = (length * value for value in direction)
+        raise bad(entries["axis"].number, "an order of X, Y and Z", order)
+    x, y, z = (length * value for value in _vector(entries["direction"]))
     freedom = entries.get("dof", Line(first, ["dof"]))
     return entries["name"].words[1], _Bone(
         freedom.number, (x, y, z), _turned(axis, order, radians), tuple(freedom.words[1:])
@@ -195,7 +195,7 @@ def _turned(angles: Sequence[float], order: str, radians: bool) -> Float[np.ndar
     return about_fixed_axes(angles if radians else np.radians(angles).tolist(), order.upper())
 
 
-def _hierarchy(path: Path, section: tuple[Line, list[Line]], bones: set[str]) -> dict[str, str]:
+def _hierarchy(section: tuple[Line, list[Line]], bones: set[str]) -> dict[str, str]:
     """Parent of every bone, parents first."""
     parents: dict[str, str] = {}
     for line in section[1]:
@@ -203,18 +203,18 @@ def _hierarchy(path: Path, section: tuple[Line, list[Line]], bones: set[str]) ->
         if above.lower() in ("begin", "end") and not below:
             continue
         if above != "root" and above not in parents:
-            raise bad(path, line.number, "bones after their parents, from root on", above)
+            raise bad(line.number, "bones after their parents, from root on", above)
         for name in below:
             if name not in bones or name in parents:
-                raise bad(path, line.number, "bones of :bonedata, each once", name)
+                raise bad(line.number, "bones of :bonedata, each once", name)
             parents[name] = above
     if set(parents) != bones:
         missing = ", ".join(sorted(bones - set(parents)))
-        raise bad(path, section[0].number, "a parent for every bone", f"none for {missing}")
+        raise bad(section[0].number, "a parent for every bone", f"none for {missing}")
     return parents
 
 
-def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.ndarray, "t c"]:
+def _parse_amc(lines: list[Line], skeleton: _Acclaim) -> Float[np.ndarray, "t c"]:
     radians = skeleton.radians
     frames: list[str] = []
     rows: list[dict[str, list[float]]] = []
@@ -227,28 +227,28 @@ def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.nd
             continue
         if not words and first.isdigit():
             if frames:
-                _check_frame(path, line.number, skeleton, rows[-1])
+                _check_frame(line.number, skeleton, rows[-1])
                 number, before = (
-                    whole_number(path, line.number, word, "a frame number")
+                    whole_number(line.number, word, "a frame number")
                     for word in (first, frames[-1])
                 )
                 if number != before + 1:
-                    raise bad(path, line.number, f"the frame after {frames[-1]}", first)
+                    raise bad(line.number, f"the frame after {frames[-1]}", first)
             frames.append(first)
             rows.append({})
             continue
         if not frames:
-            raise bad(path, line.number, "the number of the first frame, as in an AMC", first)
+            raise bad(line.number, "the number of the first frame, as in an AMC", first)
         if first not in skeleton.counts:
-            raise bad(path, line.number, "a bone of the skeleton with freedom", first)
+            raise bad(line.number, "a bone of the skeleton with freedom", first)
         if first in rows[-1]:
-            raise bad(path, line.number, "every bone once in a frame", first)
-        row = rows[-1][first] = finite_numbers(path, line.number, words, "numbers")
+            raise bad(line.number, "every bone once in a frame", first)
+        row = rows[-1][first] = finite_numbers(line.number, words, "numbers")
         if len(row) != (size := skeleton.counts[first]):
-            raise bad(path, line.number, f"{size} numbers for {first}", len(row))
+            raise bad(line.number, f"{size} numbers for {first}", len(row))
     if not frames:
-        raise bad(path, lines[-1].number, "frames, as in an AMC", "none")
-    _check_frame(path, lines[-1].number, skeleton, rows[-1])
+        raise bad(lines[-1].number, "frames, as in an AMC", "none")
+    _check_frame(lines[-1].number, skeleton, rows[-1])
     values = [number for row in rows for bone in skeleton.counts for number in row[bone]]
     table = np.array(values).reshape(len(rows), len(skeleton.is_angle))
     if radians:
@@ -256,7 +256,7 @@ def _parse_amc(path: Path, lines: list[Line], skeleton: _Acclaim) -> Float[np.nd
     return np.where(np.array(skeleton.is_angle, dtype=bool), np.radians(table), table)
 
 
-def _check_frame(path: Path, line: int, skeleton: _Acclaim, filled: Collection[str]) -> None:
+def _check_frame(line: int, skeleton: _Acclaim, filled: Collection[str]) -> None:
     """A frame is over: it must have told of every bone."""
     if missing := sorted({*skeleton.counts} - {*filled}):
-        raise bad(path, line, "all bones in the frame before", f"none for {', '.join(missing)}")
+        raise bad(line, "all bones in the frame before", f"none for {', '.join(missing)}")

@@ -43,7 +43,7 @@ from torchcss.body.files.bvh import (
 from torchcss.body.files.bvh_parser import Segment, parse_bvh, without_empty_positions
 from torchcss.body.rotations import about
 from torchcss.errors import ConfigurationError, MotionCaptureError
-from torchcss.files import StrPath, shortened
+from torchcss.files import StrPath, naming, shortened
 from torchcss.io.motion.acclaim import parse_acclaim
 from torchcss.joint_names import LIMB_JOINTS, skeleton_joint_names
 
@@ -152,7 +152,8 @@ def _parse(
     """What either format says: segments, their numbers, rate, metres per unit, and notes."""
     suffix = path.suffix.lower()
     if suffix == ".bvh":
-        segments, values, rate = parse_bvh(path)
+        with naming(path, MotionCaptureError):
+            segments, values, rate = parse_bvh(path)
         segments, empty = without_empty_positions(segments, values)
         return segments, values, rate, None, empty
     if suffix != ".amc":
