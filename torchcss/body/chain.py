@@ -162,7 +162,8 @@ def check_joints(joints: Sequence[JointSpecification]) -> None:
         if joint.kind not in ("revolute", "prismatic", "fixed"):
             raise BodyError(
                 f"joint {joint.name!r} is of type {joint.kind!r}; supported are revolute, "
-                "continuous, prismatic and fixed (split others into joints of one axis)"
+                "continuous, prismatic, fixed, and floating at the root (split others into joints "
+                "of one axis)"
             )
         numbers = np.concatenate([np.ravel(joint.rotation), joint.translation, joint.axis])
         far = not (np.abs(numbers) < _FAR).all()

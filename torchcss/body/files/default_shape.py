@@ -16,7 +16,7 @@ Call `rest_poses`, `bone_parts`, `solid_shape`, and `touching_parts` for the pai
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, count
 
@@ -282,7 +282,7 @@ def _capsule_exponent(radius: float, half: float) -> float:
     return 0.5 * (low + high)
 
 
-def unused(name: str, used: Sequence[str]) -> str:
+def unused(name: str, used: Container[str]) -> str:
     """A name, or the first of that name with a number that is not used."""
     names = (name if n == 1 else f"{name}_{n}" for n in count(1))
     return next(each for each in names if each not in used)

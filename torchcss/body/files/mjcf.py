@@ -23,17 +23,16 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh import BASE, HungTree
 from torchcss.body.files.default_shape import solid_shape, unopened_meshes, unused
 from torchcss.body.files.xml import parse_xml
-from torchcss.body.rotations import as_rows, as_vector, from_quaternion
+from torchcss.body.rotations import as_rows, as_vector, frame_at, from_quaternion
 from torchcss.errors import BodyError, optional_package
 from torchcss.files import one_line, shortened
 
@@ -88,7 +87,7 @@ def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
     if len(tops) > 1:
         others = [model.body(body).name or "without name" for body in tops if body != chosen]
         notes.append(f"of several bodies the one with most joints; not {', '.join(others)}")
-    skeleton, parts = _Reader(path, model).read(chosen, tuple(notes))
+    skeleton, parts = _Reader(model).read(chosen, tuple(notes))
     bare = {*skeleton.places} - {part.link for part in parts}
     if meshes := [link for link in meshed if link in bare]:
         note = unopened_meshes(meshes, "<geom>")
@@ -212,18 +211,11 @@ def _compiled(path: Path) -> tuple[Any, list[str], _Screen]:
         raise BodyError(f"{path}: MuJoCo cannot read this MJCF: {reason}") from error
 
 
-class _Place(NamedTuple):
-    """Orientation and origin in the frame of the link above."""
-
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
-
-
 class _Reader:
     """Makes links and parts of one body of a compiled model."""
 
-    def __init__(self, path: Path, model: Any) -> None:
-        self.path, self.model = path, model
+    def __init__(self, model: Any) -> None:
+        self.model = model
         self.joints = [JointSpecification(name=BASE, link=BASE, parent=None)]
         self.parts: list[PartSpecification] = []
         self.links: dict[int, str] = {0: BASE}
@@ -261,37 +253,37 @@ class _Reader:
         model = self.model
         name = model.body(body).name or f"body{len(self.joints)}"
         parent = self.links[int(model.body_parentid[body])]
-        place = _Place(from_quaternion(model.body_quat[body]), model.body_pos[body])
+        place = frame_at(from_quaternion(model.body_quat[body]), model.body_pos[body])
         anchor = np.zeros(3)
         for joint in np.flatnonzero(model.jnt_bodyid == body).tolist():
             if model.jnt_type[joint] == 0:
                 self.has_root = True
                 # A free body is where it is put; its drawn place only says which way is up.
-                place = place._replace(translation=np.zeros(3))
+                place[:3, 3] = 0.0
                 continue
             at = model.jnt_pos[joint]
             for turn in self._turns(joint, name):
                 parent = self._hang(turn, f"{turn.name}_link", parent, place, at - anchor)
-                anchor, place = at, _Place(np.eye(3), np.zeros(3))
+                anchor, place = at, np.eye(4)
         fixed = JointSpecification(name=f"{name}_fixed", link=name, parent=parent)
         self.links[body] = self._hang(fixed, name, parent, place, -anchor)
 
     def _hang(
-        self, joint: JointSpecification, link: str, parent: str, place: _Place, shift: np.ndarray
+        self,
+        joint: JointSpecification,
+        link: str,
+        parent: str,
+        place: np.ndarray,
+        shift: np.ndarray,
     ) -> str:
-        """Add a joint and the link below it."""
-        where = place.translation + place.rotation @ shift
+        """Add a joint and the link below it, shifted from a place in the frame of that above."""
+        rotation, where = place[:3, :3], place[:3, 3] + place[:3, :3] @ shift
         if not (np.abs(where) < _FAR).all():
             raise BodyError(
-                f"{self.path}: body {link!r}: expected places below {_FAR:g} metres, found "
-                f"{where.tolist()}"
+                f"body {link!r}: expected places below {_FAR:g} metres, found {where.tolist()}"
             )
-        at = as_vector(where)
-        self.joints.append(
-            replace(
-                joint, link=link, parent=parent, translation=at, rotation=as_rows(place.rotation)
-            )
-        )
+        at, turn = as_vector(where), as_rows(rotation)
+        self.joints.append(replace(joint, link=link, parent=parent, translation=at, rotation=turn))
         return link
 
     def _turns(self, joint: int, body: str) -> list[JointSpecification]:
@@ -324,7 +316,7 @@ class _Reader:
         size, place = model.geom_size[geom][:num_sizes], model.geom_pos[geom]
         if not ((size > 1e-6).all() and (np.abs([*size, *place]) < _FAR).all()):
             raise BodyError(
-                f"{self.path}: geom {own!r}: expected sizes above 1e-6 and below {_FAR:g} metres, "
+                f"geom {own!r}: expected sizes above 1e-6 and below {_FAR:g} metres, "
                 f"found {size.tolist()}"
             )
         self.parts.append(

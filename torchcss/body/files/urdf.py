@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +28,12 @@ from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification, check_joints, link_order
 from torchcss.body.files.bvh import HungTree
 from torchcss.body.files.bvh_parser import MOST_LINKS
-from torchcss.body.files.default_shape import solid_shape, unopened_meshes
+from torchcss.body.files.default_shape import solid_shape, unopened_meshes, unused
 from torchcss.body.files.mesh import MESH_SUFFIXES, mesh_points
 from torchcss.body.rotations import Vector3, about_fixed_axes, as_rows, as_vector
 from torchcss.errors import BodyError
 from torchcss.files import shortened
 
-_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 _SIZES = {
     "box": ("size",),
     "sphere": ("radius",),
@@ -43,6 +41,9 @@ _SIZES = {
     "capsule": ("radius", "length"),
 }
 
+
+_DRAWN = ("visual", "collision")
+"""Elements of a link that say what it looks like, the better first."""
 
 PointsOf = Callable[[Path], Float[np.ndarray, "8 3"]]
 """Reads a mesh."""
@@ -145,16 +146,9 @@ def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
 
 
 def _check_links(robot: ElementTree.Element, joints: Mapping[str, ElementTree.Element]) -> str:
-    """Check names and types, and that every link but one hangs on one joint; returns that one."""
+    """Check names, and that every link but one hangs on one joint; returns that one."""
     if len(joints) != len(robot.findall("joint")) or "" in joints:
         raise BodyError("two joints have the same name, or one has none")
-    for name, element in joints.items():
-        if element.get("type") not in _TYPES:
-            raise BodyError(
-                f"joint {name!r} is of type {element.get('type')!r}; supported are "
-                f"{', '.join(_TYPES)}, and floating at the root (split others into joints of one "
-                "axis)"
-            )
     children, parents = (
         [_link(element, tag) for element in joints.values()] for tag in ("child", "parent")
     )
@@ -238,11 +232,10 @@ def _solids(robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
     parts: list[PartSpecification] = []
     links = robot.findall("link")
     # A link's first solid has its name, also that of a link further on.
-    names = {link.get("name", "") for link in links}
+    used = {link.get("name", "") for link in links}
     for link in links:
         name = link.get("name", "")
-        free = (other for n in count(2) if (other := f"{name}_{n}") not in names)
-        for number, (element, solid) in enumerate(_simple_solids(link), start=1):
+        for further, (element, solid) in enumerate(_simple_solids(link)):
             where = f"link {name!r}: <{solid.tag}>"
             size: list[float] = []
             for key in _SIZES[solid.tag]:
@@ -256,13 +249,14 @@ def _solids(robot: ElementTree.Element) -> tuple[PartSpecification, ...]:
             translation, rotation = _origin(where, element)
             parts.append(
                 PartSpecification(
-                    name=name if number == 1 else next(free),
+                    name=unused(name, used) if further else name,
                     link=name,
                     translation=translation,
                     rotation=rotation,
                     shape=solid_shape(solid.tag, size),
                 )
             )
+            used.add(parts[-1].name)
     return tuple(parts)
 
 
@@ -277,10 +271,8 @@ def _boxes_of_meshes(
         name = link.get("name", "")
         if name in shaped or link.find("*/geometry/mesh") is None:
             continue
-        corners = _mesh_points(link, "visual", folder, notes, points_of)
-        if corners is None:
-            corners = _mesh_points(link, "collision", folder, notes, points_of)
-        if corners is None:
+        kinds = (_mesh_points(link, tag, folder, notes, points_of) for tag in _DRAWN)
+        if (corners := next((each for each in kinds if each is not None), None)) is None:
             mesh = link.find("*/geometry/mesh[@filename]")
             file = "" if mesh is None else re.split(r"[/\\]", mesh.get("filename", ""))[-1]
             unopened.append(f"{name} ({shortened(file)})")
@@ -355,7 +347,7 @@ def _simple_solids(
     link: ElementTree.Element,
 ) -> list[tuple[ElementTree.Element, ElementTree.Element]]:
     """Elements of a link that have a simple solid, with it: visual ones or else for collisions."""
-    for tag in ("visual", "collision"):
+    for tag in _DRAWN:
         found = [
             (element, solid)
             for element in link.findall(tag)
