@@ -243,12 +243,6 @@ def _row(run: Run) -> Preset | None:
     return PRESETS.get(OLD_NAMES.get(name, name))
 
 
-def _option(run: Run, name: str) -> Any:
-    """An option as it was given or else as the preset has it; None: not known."""
-    given = run.settings.get(name)
-    return getattr(_row(run), name, None) if given is None else given
-
-
 def _preset(run: Run) -> str:
     """Which tracker it was, and with which numbers."""
     row, summary = _row(run), run.summary
@@ -286,8 +280,9 @@ def _keypoints(run: Run) -> str:
     files = run.track.first_files
     if not (files and files.keypoints):
         return "not known"
-    only = ", in the first frame alone" if _option(run, "keypoints_use") == "first" else ""
-    return f"{files.keypoints}{only}"
+    row, use = _row(run), run.settings.get("keypoints_use")
+    use = row.keypoints_use if use is None and row is not None else use
+    return f"{files.keypoints}{', in the first frame alone' * (use == 'first')}"
 
 
 def _losses(run: Run) -> str:

@@ -293,7 +293,7 @@ class Evaluator:
         index = [sequence.joint_names.index(name) for name in self._common]
         self._reference = sequence.joints_world[:, index]
         self._penetration = PenetrationDepth(body)
-        self._rooted = bool(roots)
+        self._roots = [self._common.index(name) for name in roots]
 
     def __call__(self, tracked: Posterior, start: Frame, features_s: float) -> FrameMeasures:
         """Measure a frame.
@@ -311,7 +311,7 @@ class Evaluator:
         reference = self._reference[number]
         absolute = absolute_errors_mm(joints, reference)[:, :count]
         aligned = absolute
-        if self._rooted:
+        if self._roots:
             aligned = root_aligned_errors_mm(joints, reference, self._common)[:, :count]
         overlap = math.nan
         if sequence.mask is not None:
@@ -320,6 +320,7 @@ class Evaluator:
         error = _mean(aligned[0])
         weight = mixture.weight.double().cpu().numpy()
         along, across = self._directions(joints[0], reference)
+        outside, at_bound = _against_limits(body, mixture.mean[0])
         within = region_probability(
             body, mixture, self._column[:count], reference[:count], limits.reference_m,
             exact=sequence.truth is not None,
@@ -337,12 +338,12 @@ class Evaluator:
             joints_m=joints[0, :count],
             reference_m=reference[:count],
             overlap=overlap,
-            outside_degrees=_outside(body, mixture.mean[0]),
+            outside_degrees=outside,
             penetration_m=self._penetration(body, mixture.mean).depth.cpu().numpy(),
             along_mm=along,
             across_mm=across,
             apart_weight=_apart_weight(joints, weight),
-            at_bound=_at_bound(body, mixture.mean[0]),
+            at_bound=at_bound,
             evaluations=num_evaluations(tracked.info),
             seconds={
                 "features": features_s,
@@ -356,9 +357,8 @@ class Evaluator:
     ) -> tuple[float, float]:
         """Errors of the compared joints along the line of sight and across it, millimetres."""
         away, count = joints - reference, len(self.compared)
-        if self._rooted:
-            hips = [self._common.index(name) for name in ("l_hip", "r_hip")]
-            away = away - away[hips].mean(0)
+        if self._roots:
+            away = away - away[self._roots].mean(0)
         away, known = away[:count], np.isfinite(reference[:count]).all(-1)
         if not known.any() or not np.isfinite(away[known]).all():
             return math.nan, math.nan
@@ -375,21 +375,13 @@ def _apart_weight(joints: Float[np.ndarray, "k j 3"], weight: Float[np.ndarray, 
     return float(weight[apart].sum())
 
 
-def _at_bound(body: BodyModel, x: Vector) -> tuple[str, ...]:
-    """Joint parameters within half a degree of a limit."""
-    close = torch.minimum((x - body.lower).abs(), (body.upper - x).abs()) < math.radians(0.5)
-    return tuple(
-        name
-        for name, near in zip(body.state_names, close.tolist(), strict=True)
-        if near and name not in ROOT_NAMES
-    )
-
-
-def _outside(body: BodyModel, x: Vector) -> float:
-    """How far the worst joint angle is beyond its limit, degrees."""
-    joints = [i for i, name in enumerate(body.state_names) if name not in ROOT_NAMES]
+def _against_limits(body: BodyModel, x: Vector) -> tuple[float, tuple[str, ...]]:
+    """How far the worst joint angle is beyond its limit, degrees, and which are at their limits."""
+    joints = [name not in ROOT_NAMES for name in body.state_names]
     beyond = torch.maximum(body.lower - x, x - body.upper)[joints]
-    return math.degrees(max(0.0, float(beyond.max())))
+    close = beyond.abs() < math.radians(0.5)
+    names = compress(compress(body.state_names, joints), close.tolist())
+    return math.degrees(max(0.0, float(beyond.max()))), tuple(names)
 
 
 def _mean(values: Any) -> float:
