@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 from common import Table, start, write_report
-from common.comparison import body_of
+from common.comparison import TRACKING, body_of
 from peers.published import PUBLISHED
 from tqdm import tqdm
 
@@ -61,8 +61,6 @@ COLUMNS = {
     "s/frame": ("search_s_per_frame", 1),
 }
 """What the table has: until the loss, the last two over all frames."""
-TRACKING = Settings(keypoints_use="first", overlay=False)
-"""How this script tracks, where nothing else is said."""
 STEP_S = 0.5
 """Over how long weights are averaged, seconds."""
 

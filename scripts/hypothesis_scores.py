@@ -18,13 +18,12 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 from common import Table, finish, start
-from common.comparison import Entrants, body_of, by_sequence, cells_of
+from common.comparison import Comparison, Entrants, by_sequence, cells_of
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -45,20 +44,14 @@ TRACKING = Settings(preset="rr_multiple_hypothesis", overlay=False)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Comparison):
     """What is tracked, and how long."""
 
-    sequences: tuple[Path, ...]
-    """Sequence folders."""
-    seeds: int = 3
-    """Runs of each way."""
     frames: int = 100
     """Frames of each run."""
     tracking: SettingsOptions = TRACKING
     """How to track. The seed is the first of the seeds; the body counts where the sequence does not
     say which one moved; the preset is one of [RR]."""
-    out: Path | None = None
-    """JSON file to write."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +136,7 @@ def entrants(
         sequence: What.
         seed: The seed.
     """
-    settings = replace(config.tracking, body=body_of(config.tracking, sequence), seed=seed)
+    settings = config.settings_of(sequence, seed)
     begin = find_start(sequence, settings)
     plan = plan_of(sequence, settings, begin)
     tracker = plan.tracker
@@ -159,9 +152,8 @@ def entrants(
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
     noted: defaultdict[str, list[tuple[float, float]]] = defaultdict(list)
-    rows = by_sequence(config.sequences, partial(entrants, config, noted), seeds, config.frames)
+    rows = by_sequence(config, partial(entrants, config, noted))
     for name, found in rows.items():
         if noted[name] and "edges" in found:
             ranks, shares = zip(*noted[name], strict=True)
@@ -177,8 +169,7 @@ def main(config: Config) -> dict[str, Any]:
         *("rank correlation", "same best"),
     )
     table = Table("How hypotheses are scored and laid out", columns, cells)
-    report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
-    return finish(config.out, report, table)
+    return finish(config.out, config.report(rows), table)
 
 
 if __name__ == "__main__":

@@ -18,18 +18,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
 from common import Table, finish, start
-from common.comparison import Entrants, body_of, by_sequence, cells_of
+from common.comparison import Comparison, Entrants, by_sequence, cells_of
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
 from torchcss.body.root import has_root
 from torchcss.body.shape import SHAPE_NAMES, with_shape
-from torchcss.cli.options import SettingsOptions
 from torchcss.studies.comparison import Start, find_start, plan_of
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Plan, Settings
@@ -37,8 +35,6 @@ from torchcss.types import Bounds
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm", "pa_mpjpe_mm"
 """What the table shows of each tracker."""
-TRACKING = Settings(keypoints_use="first", overlay=False)
-"""How this script tracks, where nothing else is said."""
 AS_IT_IS, THREE_TIMES = "as it is", "three times"
 VARIATIONS = (
     *("clavicles at rest", "no stabilisers", "no motion boundaries"),
@@ -47,24 +43,15 @@ VARIATIONS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Comparison):
     """What is tracked, and how long."""
 
-    sequences: tuple[Path, ...]
-    """Sequence folders."""
     presets: tuple[str, ...] = ("css", "ijrr_css")
     """Trackers that are varied."""
     variations: tuple[str, ...] = VARIATIONS
     """What is changed, beside the trackers as they are."""
-    seeds: int = 3
-    """Runs of each."""
     frames: int = 40
     """Frames of each run."""
-    tracking: SettingsOptions = TRACKING
-    """How to track. The seed is the first of the seeds; the body counts where the sequence does not
-    say which one moved."""
-    out: Path | None = None
-    """JSON file to write."""
 
 
 def without_clavicles(plan: Plan, body: BodyModel) -> Plan:
@@ -109,11 +96,10 @@ def with_arms(body: BodyModel, factor: float) -> BodyModel:
 
 def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
     """The trackers of a seed by preset and variation."""
-    body = body_of(config.tracking, sequence)
     found: dict[str, tuple[Settings, Start, Plan]] = {}
     begin = None
     for preset in config.presets:
-        settings = replace(config.tracking, body=body, seed=seed, preset=preset)
+        settings = replace(config.settings_of(sequence, seed), preset=preset)
         begin = begin or find_start(sequence, settings)
         plan, model = plan_of(sequence, settings, begin), begin.first.body
         found[f"{preset}: {AS_IT_IS}"] = settings, begin, plan
@@ -131,8 +117,7 @@ def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
-    rows = by_sequence(config.sequences, partial(entrants, config), seeds, config.frames)
+    rows = by_sequence(config, partial(entrants, config))
     cells = [
         [f"{sequence}, {name}", *cells_of(row, *ERRORS)]
         for sequence, found in rows.items()
@@ -140,8 +125,7 @@ def main(config: Config) -> dict[str, Any]:
     ]
     columns = ("sequence, tracker: variation", "lost", "best mode", "best of modes", "PA")
     table = Table("Parts of the model, changed one at a time", columns, cells)
-    report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
-    return finish(config.out, report, table)
+    return finish(config.out, config.report(rows), table)
 
 
 if __name__ == "__main__":

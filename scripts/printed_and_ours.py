@@ -14,13 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from common import Table, finish, start
-from common.comparison import Entrants, body_of, by_sequence, cells_of
+from common.comparison import Comparison, Entrants, by_sequence, cells_of
 
-from torchcss.cli.options import SettingsOptions
 from torchcss.inference.tracker import Tracker
 from torchcss.studies.comparison import Start, find_start, plan_of
 from torchcss.studies.sequences import RecordedSequence
@@ -28,27 +26,16 @@ from torchcss.tracking.settings import Plan, Settings
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm", "pa_mpjpe_mm"
 """What the table shows of each tracker."""
-TRACKING = Settings(keypoints_use="first", overlay=False)
-"""How this script tracks, where nothing else is said."""
 ENDS = {"ours": ("css", "ijrr_css"), "printed": ("ijrr_css", "css")}
 """The two ends, and what each of them takes parts from."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
-    """What is tracked, and how long."""
+class Config(Comparison):
+    """What is tracked, and how long; the presets are those of the two ends."""
 
-    sequences: tuple[Path, ...]
-    """Sequence folders."""
-    seeds: int = 3
-    """Runs of each tracker."""
     frames: int = 60
     """Frames of each run."""
-    tracking: SettingsOptions = TRACKING
-    """How to track. The seed is the first of the seeds; the body counts where the sequence does not
-    say which one moved; the presets are those of the two ends."""
-    out: Path | None = None
-    """JSON file to write."""
 
 
 def with_cost(plan: Plan, other: Plan) -> Plan:
@@ -92,13 +79,11 @@ EXCHANGES: dict[str, Callable[[Plan, Plan], Plan]] = {
 
 def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
     """All trackers of a seed by name."""
-    body = body_of(config.tracking, sequence)
+    settings = config.settings_of(sequence, seed)
     found: dict[str, tuple[Settings, Start, Plan]] = {}
     begin = None
     for end, presets in ENDS.items():
-        mine, theirs = (
-            replace(config.tracking, body=body, seed=seed, preset=preset) for preset in presets
-        )
+        mine, theirs = (replace(settings, preset=preset) for preset in presets)
         begin = begin or find_start(sequence, mine)
         plan, other = (plan_of(sequence, each, begin) for each in (mine, theirs))
         found[end] = mine, begin, plan
@@ -110,8 +95,7 @@ def entrants(config: Config, sequence: RecordedSequence, seed: int) -> Entrants:
 
 def main(config: Config) -> dict[str, Any]:
     """Run, print, write; return what is written."""
-    seeds = range(config.tracking.seed, config.tracking.seed + config.seeds)
-    rows = by_sequence(config.sequences, partial(entrants, config), seeds, config.frames)
+    rows = by_sequence(config, partial(entrants, config))
     cells = [
         [f"{sequence}: {name}", *cells_of(row, *ERRORS), row["search_s_per_frame"][0]]
         for sequence, found in rows.items()
@@ -119,8 +103,7 @@ def main(config: Config) -> dict[str, Any]:
     ]
     columns = ("sequence: tracker", "lost", "best mode", "best of modes", "PA", "search, s/frame")
     table = Table("As printed against ours, part by part", columns, cells)
-    report = {"frames": config.frames, "seeds": config.seeds, "by_sequence": rows}
-    return finish(config.out, report, table)
+    return finish(config.out, config.report(rows), table)
 
 
 if __name__ == "__main__":

@@ -19,14 +19,13 @@ parameters, at a start mode of each of `--poses` seeds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from statistics import median
 from typing import Any, NamedTuple
 
 import torch
 from common import Table, finish, start
-from common.comparison import body_of
+from common.comparison import Comparison
 from jaxtyping import Float
 from torch import Tensor
 
@@ -45,22 +44,16 @@ BODIES = ("arm8", "body32")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config:
+class Config(Comparison):
     """What is tracked, and how long."""
 
-    sequences: tuple[Path, ...]
-    """Sequence folders."""
     frames: int = 30
-    """Frames of each."""
-    seeds: int = 3
-    """Runs of each."""
+    """Frames of each run."""
     poses: int = 10
     """Poses of each body whose joints are seen in one image."""
     tracking: SettingsOptions = TRACKING
     """How to track. The seed is the first of the seeds; the body counts where the sequence does not
     say which one moved."""
-    out: Path | None = None
-    """JSON file to write."""
 
 
 class Spread(NamedTuple):
@@ -115,13 +108,9 @@ def main(config: Config) -> dict[str, Any]:
     cells: list[list[str | float | None]] = []
     for folder in config.sequences:
         sequence = read_sequence(folder)
-        own = body_of(config.tracking, sequence)
-        found[sequence.name] = runs = []
-        for seed in range(config.tracking.seed, config.tracking.seed + config.seeds):
-            runs.append(
-                track(sequence, replace(config.tracking, body=own, seed=seed), config.frames)
-            )
-        cells.append([f"{sequence.name}, {own}", *medians(runs)])
+        every = [config.settings_of(sequence, seed) for seed in config.all_seeds]
+        found[sequence.name] = runs = [track(sequence, each, config.frames) for each in every]
+        cells.append([f"{sequence.name}, {every[0].body}", *medians(runs)])
     for body in BODIES:
         found[f"joints of {body}"] = runs = [of_joints(body, seed) for seed in range(config.poses)]
         cells.append([f"joints in one image, {body}", *medians(runs)])

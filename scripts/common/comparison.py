@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from torchcss.cli.options import SettingsOptions
 from torchcss.studies.comparison import Start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
 from torchcss.studies.sequences import RecordedSequence, read_sequence
@@ -15,6 +17,38 @@ from torchcss.tracking.settings import Plan, Settings
 
 Entrants = Mapping[str, tuple[Settings, Start, Plan]]
 """What is run: settings, first pose and plan by name."""
+TRACKING = Settings(keypoints_use="first", overlay=False)
+"""How comparisons track, where nothing else is said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What is tracked, and how long."""
+
+    sequences: tuple[Path, ...]
+    """Sequence folders."""
+    seeds: int = 3
+    """Runs of each tracker."""
+    frames: int
+    """Frames of each run."""
+    tracking: SettingsOptions = TRACKING
+    """How to track. The seed is the first of the seeds; the body counts where the sequence does not
+    say which one moved; presets that are compared count before its own."""
+    out: Path | None = None
+    """JSON file to write."""
+
+    @property
+    def all_seeds(self) -> range:
+        """The seeds of the runs."""
+        return range(self.tracking.seed, self.tracking.seed + self.seeds)
+
+    def settings_of(self, sequence: RecordedSequence, seed: int) -> Settings:
+        """How a sequence is tracked with a seed."""
+        return replace(self.tracking, body=body_of(self.tracking, sequence), seed=seed)
+
+    def report(self, by_sequence: Mapping[str, Any]) -> dict[str, Any]:
+        """What is written of what was found by sequence."""
+        return {"frames": self.frames, "seeds": self.seeds, "by_sequence": by_sequence}
 
 
 def summaries(
@@ -46,30 +80,25 @@ def summaries(
 
 
 def by_sequence(
-    folders: Iterable[Path],
-    entrants: Callable[[RecordedSequence, int], Entrants],
-    seeds: Iterable[int],
-    frames: int,
+    config: Comparison, entrants: Callable[[RecordedSequence, int], Entrants]
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Run the trackers of several seeds on several sequences.
 
     Args:
-        folders: The sequences.
+        config: Which sequences and seeds, and how many frames, where a sequence has as many.
         entrants: The trackers of a sequence and a seed.
-        seeds: The seeds.
-        frames: How many frames, where a sequence has as many.
 
     Returns:
         By sequence and tracker that was measured median, least and greatest of its numbers
         (`over_seeds`).
     """
     found = {}
-    for folder in folders:
+    for folder in config.sequences:
         sequence, runs = read_sequence(folder), {}
-        for seed in seeds:
+        for seed in config.all_seeds:
             named = entrants(sequence, seed)
             runs |= {name: runs.get(name, []) for name in named}
-            for name, summary in summaries(sequence, named, frames):
+            for name, summary in summaries(sequence, named, config.frames):
                 runs[name].append(summary)
         found[sequence.name] = {name: over_seeds(each) for name, each in runs.items() if each}
     return found

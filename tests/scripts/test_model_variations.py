@@ -16,7 +16,7 @@ from torchcss.studies.sequences import read_sequence
 
 def small(script: ModuleType, folder: Path, **changes: object):
     write_arm(folder, 3)
-    tracking = replace(script.TRACKING, working_size=160, samples=6, modes=2)
+    tracking = replace(script.Config.tracking, working_size=160, samples=6, modes=2)
     config = script.Config(sequences=(folder,), seeds=1, frames=3, tracking=tracking)
     return replace(config, **changes)
 

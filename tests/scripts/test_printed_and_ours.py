@@ -15,7 +15,7 @@ from torchcss.studies.sequences import read_sequence
 def test_small_mode(script: ModuleType, tmp_path: Path) -> None:
     folder, out = tmp_path / "arm", tmp_path / "exchange.json"
     write_arm(folder, 2)
-    small = replace(script.TRACKING, working_size=160, samples=4)
+    small = replace(script.Config.tracking, working_size=160, samples=4)
     config = script.Config(sequences=(folder,), seeds=1, frames=2, tracking=small, out=out)
     report = script.main(config)
     (rows,) = report["by_sequence"].values()
