@@ -291,26 +291,22 @@ class TrackingSession:
         Yields:
             What is known after each of them.
         """
+        observations = map(self.observe, images)
         try:
             if self.settings.threads < 2:
-                yield from (self.step(self.observe(each)) for each in images)
+                yield from map(self.step, observations)
             else:
-                yield from self._track_seeing_ahead(iter(images))
+                yield from self._track_seeing_ahead(observations)
         finally:
             self._expect(self.state)  # what was seen ahead is seen anew
 
-    def _track_seeing_ahead(self, coming: Iterator[Images]) -> Iterator[Posterior]:
+    def _track_seeing_ahead(self, coming: Iterator[Observation]) -> Iterator[Posterior]:
         """The same, each moment seen while the one before is searched."""
-
-        def see() -> Observation | None:
-            each = next(coming, None)
-            return None if each is None else self.observe(each)
-
         # torch's own threads are set thread by thread.
         with ThreadPoolExecutor(1, initializer=partial(torch.set_num_threads, 1)) as pool:
-            pending = pool.submit(see)
+            pending = pool.submit(next, coming, None)
             while (observation := pending.result()) is not None:
-                pending = pool.submit(see)
+                pending = pool.submit(next, coming, None)
                 yield self.step(observation)
 
     def observe(self, images: Images) -> Observation:
@@ -452,8 +448,9 @@ class TrackingSession:
     ) -> tuple[MonitorState, bool]:
         """What tells a loss after a frame, and whether it tells one."""
         watched = {term.name for term in self.plan.choice.terms if term.watched}
-        per_view = _per_view(terms, observation).items()
-        costs = {name: cost for name, cost in per_view if name in watched}
+        # Per view: the sum falls when a view is out, and is no better for it.
+        seen = max(1, sum(view.features is not None for view in observation.views))
+        costs = {name: cost / seen for name, cost in terms.items() if name in watched}
         return self.plan.monitor.update(self.state.monitor, costs)
 
     def _of_views(
@@ -493,19 +490,21 @@ class TrackingSession:
         Particle filters have neither: they search by the noise of their own dynamics. Nor has a
         `GridTracker`.
         """
-        plan, state = self.plan, self.state
+        plan, state, frame = self.plan, self.state, int(self.state.tracker.frame)
         tracker = plan.tracker if intervals == 1 else plan.tracker.over(intervals)
         if not isinstance(tracker, Tracker):
             return tracker
-        if plan.one_fit and int(state.tracker.frame) == 0:
+        if plan.one_fit and frame == 0:
             tracker = replace(tracker, proposal=_AS_FITTED)
         search, dynamics, num = tracker.proposal, tracker.dynamics, tracker.num_samples
         camera, moves = self._observers[0].view.camera, []
-        if self._flips_now():
-            flips = Flips(search=search, body=state.body, camera=camera, num=_NUM_FLIPS)
-            moves.append((flips, _NUM_FLIPS))
-        if (missed := self._missed_keypoints(cost, search)) is not None:
-            moves.append((missed, _NUM_FLIPS))
+        if plan.jumps_every and len(self._observers) == 1:  # to several cameras they look unlike
+            if frame % plan.jumps_every == 0:
+                flips = Flips(search=search, body=state.body, camera=camera, num=_NUM_FLIPS)
+                moves.append((flips, _NUM_FLIPS))
+            # The first pose was fitted to the keypoints.
+            if frame > 0 and (missed := self._missed_keypoints(cost, search)) is not None:
+                moves.append((missed, _NUM_FLIPS))
         if plan.limb_jumps:
             limbs = LostLimbs(search=search, body=state.body, cost=cost, num=plan.limb_jumps)
             moves.append((limbs, 2 * plan.limb_jumps))
@@ -525,9 +524,7 @@ class TrackingSession:
         return replace(tracker, proposal=with_moves(search, moves, num), dynamics=dynamics)
 
     def _missed_keypoints(self, cost: TrackingCost, search: Proposal) -> MissedKeypoints | None:
-        """The move to keypoints that the best mode misses; the first pose was fitted to them."""
-        if not self._flips_at_all or int(self.state.tracker.frame) == 0:
-            return None
+        """The move to keypoints that the best mode misses."""
         keypoints = cost.views[0].keypoints
         term = next((term for term in cost.choice.terms if isinstance(term, JointTerm)), None)
         if keypoints is None or term is None:
@@ -540,15 +537,6 @@ class TrackingSession:
             term=term,
             num=_NUM_FLIPS,
         )
-
-    @property
-    def _flips_at_all(self) -> bool:
-        """Whether poses that look alike are searched; to several cameras they look unlike."""
-        return bool(self.plan.jumps_every) and len(self._observers) == 1
-
-    def _flips_now(self) -> bool:
-        """Whether the flips of the best mode are searched."""
-        return self._flips_at_all and int(self.state.tracker.frame) % self.plan.jumps_every == 0
 
     def _terms_of_best(self, cost: TrackingCost, modes: GaussianMixture) -> dict[str, float]:
         """What the best mode costs by term, about the prior that the search had."""
@@ -574,12 +562,6 @@ def _one_fit(first: Initialisation, bounds: Bounds) -> GaussianMixture:
     free = (best.mean > bounds.lower.to(best.mean)) & (best.mean < bounds.upper.to(best.mean))
     both = free[:, :, None] & free[:, None, :]
     return best._replace(covariance=torch.where(both, best.covariance, 0.0))
-
-
-def _per_view(terms: dict[str, float], observation: Observation) -> dict[str, float]:
-    """What a frame costs a view: the sum falls when a view is out, and is no better for it."""
-    seen = max(1, sum(view.features is not None for view in observation.views))
-    return {name: value / seen for name, value in terms.items()}
 
 
 def follow_with_base(body: BodyModel, state: TrackerState) -> tuple[BodyModel, TrackerState]:
