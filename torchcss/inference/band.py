@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.linalg import mask_free, multiply, symmetric_part
+from torchcss.linalg import mask_free, multiply, solve_lower, symmetric_part
 from torchcss.types import Matrices, Trajectory
 
 _ROUNDS = 200
@@ -88,9 +88,7 @@ class BandFactor(NamedTuple):
             part = vector[row]
             for d in range(1, min(width - 1, row) + 1):
                 part = part - self.block[row, d] @ out[row - d]
-            out[row] = torch.linalg.solve_triangular(
-                self.block[row, 0], part[:, None], upper=False
-            )[:, 0]
+            out[row] = solve_lower(self.block[row, 0], part)
         for row in reversed(range(t)):
             part = out[row]
             for d in range(1, min(width, t - row)):

@@ -78,20 +78,6 @@ class Transition:
         return step * velocity, change * acceleration
 
 
-class TransitionSum(NamedTuple):
-    """The transitions' share of the sum.
-
-    Attributes:
-        value: Nats.
-        gradient: By the state of every frame.
-        band: The Hessian, in the layout of `Band.block`.
-    """
-
-    value: Float[Tensor, ""]
-    gradient: Trajectory
-    band: Float[Tensor, "t w n n"]
-
-
 class Chain(NamedTuple):
     """The quadratic model of the whole sum.
 
@@ -99,7 +85,7 @@ class Chain(NamedTuple):
         value: The sum.
         gradient: Its derivative.
         hessian: Of the frames' costs.
-        motion: Second derivative of the transitions.
+        motion: Second derivative of the transitions, in the layout of `Band.block`.
         frames: The frames' costs alone.
     """
 
@@ -108,17 +94,6 @@ class Chain(NamedTuple):
     hessian: Float[Tensor, "t n n"]
     motion: Float[Tensor, "t w n n"]
     frames: LocalModel
-
-    @staticmethod
-    def of(frames: LocalModel, motion: TransitionSum) -> Chain:
-        """Frames and transitions together."""
-        return Chain(
-            frames.value.sum() + motion.value,
-            frames.gradient + motion.gradient,
-            symmetric_part(frames.hessian),
-            motion.band,
-            frames,
-        )
 
     @property
     def is_finite(self) -> bool:
@@ -167,7 +142,7 @@ class ChainSum(NamedTuple):
         """The model of the sum at a state."""
         model = self.cost.local_model(x.to(self.dtype))
         frames = LocalModel(*(self.likelihood_power * part.detach().double() for part in model))
-        return Chain.of(frames, motion_terms(x, self.times, self.transition, self.changes))
+        return linked(frames, x, self.times, self.transition, self.changes)
 
 
 def descend(
@@ -249,12 +224,17 @@ def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
     return bounds.hold(x, gradient) | (bounds.lower == bounds.upper)
 
 
-def motion_terms(
-    x: Trajectory, times: Float[Tensor, " t"], transition: Transition, changes: Changes
-) -> TransitionSum:
-    """Value, gradient and (Gauss-Newton) Hessian of the transitions.
+def linked(
+    frames: LocalModel,
+    x: Trajectory,
+    times: Float[Tensor, " t"],
+    transition: Transition,
+    changes: Changes,
+) -> Chain:
+    """The frames with the transitions between them, whose Hessian is Gauss-Newton's.
 
     Args:
+        frames: Costs of the frames.
         x: State of every frame.
         times: Times of the frames, seconds.
         transition: How far states may move, and may change how they move.
@@ -264,17 +244,16 @@ def motion_terms(
     motion, turn = transition.deviations(times, n)
     eye = torch.eye(n, dtype=x.dtype, device=x.device)
     width = 1 + min(2 if transition.judges_acceleration else 1, t - 1)
-    gradient, band = torch.zeros_like(x), x.new_zeros(t, width, n, n)
-    value = x.new_zeros(())
+    value, gradient, band = x.new_zeros(()), torch.zeros_like(x), x.new_zeros(t, width, n, n)
     # Where each frame lies in the coordinates of the next and of the next but one.
     ahead, slope = x.clone(), eye.repeat(t, 1, 1)
-    for step in changes:
+    for step, change in changes.items():
         if step < t - 1:
-            ahead[step], slope[step] = with_slope(changes[step], x[step])
+            ahead[step], slope[step] = with_slope(change, x[step])
     far, far_slope = ahead.clone(), slope.clone()
-    for step in changes:
+    for step, change in changes.items():
         if 1 <= step < t - 1:
-            far[step - 1], turned = with_slope(changes[step], ahead[step - 1])
+            far[step - 1], turned = with_slope(change, ahead[step - 1])
             far_slope[step - 1] = turned @ slope[step - 1]
 
     def add(residual: Tensor, factors: list[Tensor]) -> None:
@@ -306,7 +285,8 @@ def motion_terms(
                 (weight * ratio)[..., None] * far_slope[:-2],
             ],
         )
-    return TransitionSum(value, gradient, band)
+    gradient += frames.gradient
+    return Chain(frames.value.sum() + value, gradient, symmetric_part(frames.hessian), band, frames)
 
 
 def with_slope(

@@ -52,12 +52,12 @@ from torchcss.inference.chain import (
     Transition,
     descend,
     held_by,
+    linked,
     marginals,
-    motion_terms,
     with_slope,
 )
 from torchcss.inference.trust_region import default_prior_variance
-from torchcss.linalg import multiply, symmetric_part, whitener, with_least_width
+from torchcss.linalg import multiply, solve_lower, symmetric_part, whitener, with_least_width
 from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector, frozen
 
 
@@ -419,7 +419,7 @@ def refine_in_windows(
             del held[frame]
         first = done
     frames = LocalModel(*(torch.stack(entries) for entries in zip(*models, strict=True)))
-    chain = Chain.of(frames, motion_terms(x, times, transition, changes))
+    chain = linked(frames, x, times, transition, changes)
     return _refined(x, chain, worst, steps, limits, choice, start)
 
 
@@ -473,7 +473,7 @@ def _gaussian_cost(
     matrix = wide[..., judged, :][..., judged] / units
     torch.linalg.diagonal(matrix).add_(1.0)
     factor = torch.linalg.cholesky(symmetric_part(matrix))
-    white = torch.linalg.solve_triangular(factor, z[..., None], upper=False)[..., 0]
+    white = solve_lower(factor, z)
     return 0.5 * white.square().sum(-1) + torch.linalg.diagonal(factor).log().sum(-1)
 
 
