@@ -38,7 +38,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -423,7 +423,26 @@ class Spherical(ScaledProposal):
 
 
 @frozen
-class Condensation(_RandomProposal):
+class _NoisyProposal(_RandomProposal):
+    """A random proposal with dynamical noise of its own.
+
+    Attributes:
+        deviation: Standard deviation of the noise, one number or one per parameter: `Q` is the
+            diagonal matrix of their squares.
+    """
+
+    deviation: Deviation
+
+    def __post_init__(self) -> None:
+        check_range(self, "deviation")
+
+    def over(self, intervals: float) -> Self:
+        """See `Proposal.over`."""
+        return replace(self, deviation=summed(self.deviation, intervals))
+
+
+@frozen
+class Condensation(_NoisyProposal):
     """Randomise the modes by dynamical noise alone: `N(mu_i, Q)`, Fig. 8d (1) [IJRR].
 
     How CONDENSATION searches, and Heap and Hogg's tracker before its descents: the noise is the
@@ -438,23 +457,14 @@ class Condensation(_RandomProposal):
         correlated_projection: As in `CovarianceScaled`.
     """
 
-    deviation: Deviation
-
-    def __post_init__(self) -> None:
-        check_range(self, "deviation")
-
     def law(self, mixture: GaussianMixture) -> _Law:
         """Noise about every mode."""
         noise = noise_covariance(self.deviation, mixture.covariance)
         return _Law(mixture._replace(covariance=noise.expand_as(mixture.covariance)))
 
-    def over(self, intervals: float) -> Condensation:
-        """See `Proposal.over`."""
-        return replace(self, deviation=summed(self.deviation, intervals))
-
 
 @frozen
-class ChamRehg(_RandomProposal):
+class ChamRehg(_NoisyProposal):
     """Sample within the modes' covariances, and add dynamical noise: Fig. 8d (2) [IJRR].
 
     The sampler of Cham and Rehg's multiple-hypothesis tracker, as [IJRR] describes it: modes with
@@ -472,24 +482,16 @@ class ChamRehg(_RandomProposal):
         correlated_projection: As in `CovarianceScaled`.
     """
 
-    deviation: Deviation
     piecewise: bool = True
-
-    def __post_init__(self) -> None:
-        check_range(self, "deviation")
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Gaussians widened by noise, each in its own piece of the state space."""
         covariance = mixture.covariance + noise_covariance(self.deviation, mixture.covariance)
         return _Law(mixture._replace(covariance=covariance), piecewise=self.piecewise)
 
-    def over(self, intervals: float) -> ChamRehg:
-        """See `Proposal.over`."""
-        return replace(self, deviation=summed(self.deviation, intervals))
-
 
 @frozen
-class InflatedPosterior(ScaledProposal):
+class InflatedPosterior(ScaledProposal, _NoisyProposal):
     """Sample the posterior raised to the power 1/s, then noise: section 9 [IJRR].
 
     To that power, a mode's Gaussian `pi N(mu, Sigma)` has the covariance `s Sigma` and the weight
@@ -519,10 +521,6 @@ class InflatedPosterior(ScaledProposal):
             self.deviation, mixture.covariance
         )
         return _Law(GaussianMixture(mixture.mean, covariance, mixture.log_weight / scale))
-
-    def over(self, intervals: float) -> InflatedPosterior:
-        """See `Proposal.over`."""
-        return replace(self, deviation=summed(self.deviation, intervals))
 
 
 @frozen
