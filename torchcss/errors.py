@@ -95,7 +95,7 @@ def check_positive(choice: object, *names: str, hint: str = "", finite: bool = F
 
     Args:
         choice: A record of choices.
-        names: Its attributes.
+        names: Its attributes: a number each, or a tuple of them.
         hint: What to do, for the message.
         finite: Infinity is no number either.
 
@@ -104,9 +104,15 @@ def check_positive(choice: object, *names: str, hint: str = "", finite: bool = F
     """
     for name in names:
         value = getattr(choice, name)
-        if value is not None and not (value > 0 and (value < math.inf or not finite)):
+        if not all(each > 0 and (each < math.inf or not finite) for each in _numbers(value)):
             where = f"{type(choice).__name__}.{name}"
             raise ConfigurationError(f"{where}: expected a positive number, got {value}{hint}")
+
+
+def _numbers(value: Any) -> tuple[Any, ...]:
+    """What there is of an attribute."""
+    # Trackers are made anew for each frame: tensors would take far longer.
+    return value if isinstance(value, tuple) else () if value is None else (value,)
 
 
 def make_whole(choice: object, *names: str) -> None:
@@ -152,9 +158,9 @@ def check_range(
     span = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
     for name in names:
         value = getattr(choice, name)
-        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
-        # Trackers are made anew for each frame: tensors would take far longer.
-        if not all(least <= each <= most and (each < math.inf or not finite) for each in numbers):
+        if not all(
+            least <= each <= most and (each < math.inf or not finite) for each in _numbers(value)
+        ):
             where = f"{type(choice).__name__}.{name}"
             raise ConfigurationError(f"{where}: expected {span}, got {value}{hint}")
 

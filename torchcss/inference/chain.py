@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchcss.errors import ConfigurationError
+from torchcss.errors import check_positive
 from torchcss.inference.band import Band, least_in_box
 from torchcss.linalg import mask_free, multiply, symmetric_part
 from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector, frozen
@@ -45,11 +45,7 @@ class Transition:
     acceleration: float | tuple[float, ...] = math.inf
 
     def __post_init__(self) -> None:
-        for name in ("velocity", "acceleration"):
-            if not bool((torch.as_tensor(getattr(self, name)) > 0).all()):
-                raise ConfigurationError(
-                    f"Transition.{name}: expected positive numbers, got {getattr(self, name)}"
-                )
+        check_positive(self, "velocity", "acceleration")
 
     @property
     def judges_acceleration(self) -> bool:

@@ -27,7 +27,13 @@ from torchcss.cost.region import RegionTerm
 from torchcss.cost.segmentation import SegmentationTerm
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.cost.total import Engine
-from torchcss.errors import ConfigurationError, check_device, check_range, make_whole
+from torchcss.errors import (
+    ConfigurationError,
+    check_device,
+    check_positive,
+    check_range,
+    make_whole,
+)
 from torchcss.inference.dynamics import ConstantVelocity, Deviation
 from torchcss.inference.grid_tracker import GridTracker
 from torchcss.inference.loss_monitor import LossMonitor
@@ -234,11 +240,8 @@ class Settings:
         check_range(self, *counts, least=1)
         check_range(self, "working_size", least=64, hint="; smaller pictures show no limbs")
         check_range(self, "contour_weight", "limb_jumps")
-        check_range(self, "boundary_emphasis", most=1)
-        if self.likelihood_power is not None and not 0 < self.likelihood_power <= 1:
-            raise ConfigurationError(
-                f"likelihood_power must lie above 0 and at most at 1, got {self.likelihood_power}"
-            )
+        check_range(self, "boundary_emphasis", "likelihood_power", most=1)
+        check_positive(self, "likelihood_power")
         if self.ground is not None and not math.isfinite(self.ground):
             raise ConfigurationError(f"ground must be finite, metres, got {self.ground}")
 

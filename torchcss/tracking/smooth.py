@@ -24,7 +24,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel
 from torchcss.body.root import ROOT_NAMES, free_turns, has_root, move_base
-from torchcss.errors import ConfigurationError, TrackFileError, check_positive
+from torchcss.errors import TrackFileError, check_positive, check_range
 from torchcss.inference.smoothing import (
     GaussianEvidence,
     Refined,
@@ -63,8 +63,7 @@ class Smoothing:
     lag: int | None = None
 
     def __post_init__(self) -> None:
-        if self.lag is not None and self.lag < 0:
-            raise ConfigurationError(f"lag: expected at least 0 frames, got {self.lag}")
+        check_range(self, "lag", hint=" frames")
         check_positive(self, "likelihood_power", "acceleration_ratio", "persistence", finite=True)
 
     @property
