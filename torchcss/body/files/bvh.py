@@ -93,7 +93,7 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTr
     num_frames, is_z_up = len(values), all(stands_along_z(segments, values))
     if not num_frames:  # a skeleton alone: one pose, all channels zero
         values = np.zeros((1, values.shape[1]))
-    scale, unit_line = _metres(path, segments, units)
+    scale, unit_line = metres_per_unit(path, segments, units)
     moves = np.ptp(values, axis=0) > 1e-6
     angles = [turn.column for segment in segments[1:] for turn in segment.turns if turn.is_rotation]
     has_motion = bool(moves[angles].any())
@@ -139,11 +139,23 @@ def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTr
     return HungTree(tuple(joints), sticky, tuple(notes), names, True, is_z_up)
 
 
-def metres_per_unit(units: str | float | None) -> float | None:
-    """Metres per unit of a file, given as a number or by a name of `UNITS`; None: not given.
+def metres_per_unit(
+    path: Path,
+    segments: Sequence[Segment],
+    units: str | float | None,
+    stated: float | None = None,
+) -> tuple[float, str]:
+    """Metres per unit of a motion capture file, and a line that says how that is known.
+
+    Args:
+        path: The file, for the message.
+        segments: Its skeleton.
+        units: Metres per unit, or a name of `UNITS`; None: as stated, or guessed.
+        stated: Metres per unit, if the file says so; taken if a person results.
 
     Raises:
-        ConfigurationError: If it is neither.
+        ConfigurationError: If the units are none.
+        MotionCaptureError: If the skeleton is no person's in any unit.
     """
     if isinstance(units, str):
         try:
@@ -152,22 +164,12 @@ def metres_per_unit(units: str | float | None) -> float | None:
             raise ConfigurationError(
                 f"units: expected {', '.join(UNITS)} or metres per unit, got {units!r}"
             ) from None
-    if units is not None and not 0 < units < math.inf:
-        raise ConfigurationError(f"units: expected a positive number of metres, got {units}")
-    return units
-
-
-def guess_units(path: Path, span: float, stated: float | None) -> tuple[float, str]:
-    """Metres per unit of a motion capture file, and a line that says how that is known.
-
-    Args:
-        path: The file, for the message.
-        span: `skeleton_span`, in the file's unit.
-        stated: Metres per unit, if the file says so; taken if a person results.
-
-    Raises:
-        MotionCaptureError: If the skeleton is no person's in any unit.
-    """
+    if units is not None:
+        if not 0 < units < math.inf:
+            raise ConfigurationError(f"units: expected a positive number of metres, got {units}")
+        return units, f"unit: {1000 * units:.3f} mm, as given"
+    with np.errstate(all="ignore"):  # what overflows is no person's
+        span = skeleton_span(segments)
 
     def is_person(metres: float) -> bool:
         return _LEAST_PERSON < span * metres / _PERSON_SPAN < _LARGEST_PERSON
@@ -187,9 +189,9 @@ def guess_units(path: Path, span: float, stated: float | None) -> tuple[float, s
     )
 
 
-def skeleton_span(rest: Float[np.ndarray, "j 3"], segments: Sequence[Segment]) -> float:
+def skeleton_span(segments: Sequence[Segment]) -> float:
     """Greatest distance between two joints along the tree, whatever the pose."""
-    deepest = np.zeros(len(segments))
+    rest, deepest = rest_positions(segments), np.zeros(len(segments))
     span = 0.0
     for index in range(len(segments) - 1, 0, -1):
         parent = segments[index].parent
@@ -236,16 +238,6 @@ def stands_along_z(
     with np.errstate(all="ignore"):
         share = [float(v[2] / np.linalg.norm(v)) for v in (up, mean)]
     return share[0] > 0.9, share[1] > 0.7
-
-
-def _metres(
-    path: Path, segments: Sequence[Segment], units: str | float | None
-) -> tuple[float, str]:
-    if (metres := metres_per_unit(units)) is not None:
-        return metres, f"unit: {1000 * metres:.3f} mm, as given"
-    with np.errstate(all="ignore"):  # what overflows is no person's
-        span = skeleton_span(rest_positions(segments), segments)
-    return guess_units(path, span, None)
 
 
 def _limits(angles: np.ndarray, has_motion: bool, locks: bool) -> tuple[float, float]:

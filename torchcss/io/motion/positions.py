@@ -34,10 +34,8 @@ from jaxtyping import Float
 
 from torchcss.body.files.bvh import (
     Z_UP_NOTE,
-    guess_units,
     metres_per_unit,
     rest_positions,
-    skeleton_span,
     stands_along_z,
 )
 from torchcss.body.files.bvh_parser import Segment, parse_bvh, without_empty_positions
@@ -105,7 +103,6 @@ def read_motion_capture(
         ConfigurationError: If `units` or `frame_rate` is not positive or unknown.
     """
     path = Path(path)
-    scale = metres_per_unit(units)
     if frame_rate is not None and not 0 < frame_rate < math.inf:
         raise ConfigurationError(f"frame rate: expected a positive number, got {frame_rate}")
     segments, values, rate, stated, report = _parse(path, skeleton)
@@ -123,9 +120,8 @@ def read_motion_capture(
     report = [f"{len(values)} frames, {rate:g} per second", *report]
     with np.errstate(all="ignore"):  # whatever overflows is found below
         rest, joints = rest_positions(segments), _positions(segments, values)
-        if scale is None:
-            scale, line = guess_units(path, skeleton_span(rest, segments), stated)
-            report.append(line)
+        scale, line = metres_per_unit(path, segments, units, stated)
+        report.append(line)
         rest, joints = scale * rest, scale * joints
         along_z = (up == "z",) * 2
         if up is None and path.suffix.lower() == ".bvh":
