@@ -36,8 +36,7 @@ By default: `read_keypoints(path, image_size_wh=(w, h), num_frames=t)`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -197,16 +196,16 @@ def read_person(
                 f"unknown layout {layout!r}; the known ones are {', '.join((*ALIASES, OWN_NAMES))}"
             )
         people = in_plain_words(_read(path, whom.image_size_wh, film.num_frames))
-        names = partial(_joint_names, people, layout=layout or people.layout, links=links)
-        return _person(people, film, whom, normalised, names)
+        return _person(people, film, whom, layout, normalised, links)
 
 
 def _person(
     people: People,
     film: Film,
     whom: Whom,
+    layout: str | None,
     normalised: bool | Scale,
-    names_of: Callable[[np.ndarray, list[str]], Names],
+    links: Links,
 ) -> Keypoints:
     """Who is followed, checked and in pixels."""
     first_frame, _, image_size_wh = whom
@@ -227,17 +226,15 @@ def _person(
         check_not_in_space(frames)
     if people.corner_fractions:
         scale, shift, note = _from_corner(points, image_size_wh)
-    elif people.size_wh is not None and _are_pixels(points, normalised):
-        scale, shift, note = _from_other_size(people.size_wh, image_size_wh)
     else:
-        scale, shift, note = _from_border_pixels(points, image_size_wh, normalised)
+        scale, shift, note = _from_border_pixels(points, people.size_wh, image_size_wh, normalised)
     report += note
     _check_places(scale * points + shift, image_size_wh)
     for frame in frames:
         frame[..., :2] = scale * frame[..., :2] + shift
     tracks = [[person.track for person in frame] for frame in everyone]
     chosen = follow_person(frames, tracks, whom, report)
-    names = names_of(chosen, report)
+    names = _joint_names(people, chosen, layout or people.layout, links, report)
     chosen = with_sides_put_back(chosen, names, report)
     report += findings(chosen, names, image_size_wh, first_frame)
     positions = np.where(chosen[..., 2:] > 0.0, chosen[..., :2], 0.0)
@@ -442,21 +439,15 @@ def _from_other_size(size_wh: tuple[float, float], image_size_wh: Size) -> Chang
     return scale, 0.0, [note]
 
 
-def _are_fractions(points: np.ndarray) -> bool:
-    return bool((np.abs(points) <= _NORMALISED_EXTENT).all())
-
-
-def _are_pixels(points: np.ndarray, normalised: bool | Scale) -> bool:
-    """Whether coordinates are pixels as the caller says, and can be."""
-    return normalised in (False, "pixels") and not _are_fractions(points)
-
-
 def _from_border_pixels(
-    points: np.ndarray, image_size_wh: Size, normalised: bool | Scale
+    points: np.ndarray,
+    said_wh: tuple[float, float] | None,
+    image_size_wh: Size,
+    normalised: bool | Scale,
 ) -> Change:
-    """Pixels, or fractions from the centres of border pixels, as the caller says."""
-    fractions = _are_fractions(points)
-    if normalised is False or normalised == "pixels":
+    """Pixels, maybe of another size, or fractions from the centres of border pixels, as said."""
+    fractions = bool((np.abs(points) <= _NORMALISED_EXTENT).all())
+    if normalised in (False, "pixels"):
         if fractions:
             raise KeypointError(
                 f"expected pixels, but all coordinates lie between {points.min():.3g} and "
@@ -464,7 +455,7 @@ def _from_border_pixels(
                 "--normalised zero-one (or plus-minus-one); MoveNet's, which have y before x, save "
                 "as an array [frames 1 1 17 3]"
             )
-        return 1.0, 0.0, []
+        return (1.0, 0.0, []) if said_wh is None else _from_other_size(said_wh, image_size_wh)
     if not fractions:
         raise KeypointError(
             f"expected fractions of the image, but coordinates reach "
@@ -499,7 +490,7 @@ def _check_places(points: np.ndarray, image_size_wh: Size) -> None:
 
 
 def _joint_names(
-    people: People, chosen: np.ndarray, report: list[str], *, layout: str | None, links: Links
+    people: People, chosen: np.ndarray, layout: str | None, links: Links, report: list[str]
 ) -> Names:
     """Names of the joints: the body's own where the file has them, else those of people."""
     own = people.names or ()
