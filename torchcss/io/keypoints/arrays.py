@@ -40,7 +40,16 @@ from torchcss.io.keypoints.people import (
     keep_places,
     screened,
 )
-from torchcss.io.keypoints.words import FRAMES, ORDER_NAMES, SCORES, SHAPES, SIDES, SIZES, first_of
+from torchcss.io.keypoints.words import (
+    FRAMES,
+    ORDER_NAMES,
+    SCORES,
+    SHAPES,
+    SIDES,
+    SIZES,
+    first_of,
+    key_of,
+)
 from torchcss.joint_names import names_in
 from torchcss.types import Keypoints
 
@@ -71,7 +80,7 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     texts = {key: each for key, each in arrays.items() if each.dtype.kind in "SU"}
     numbers = {key: each for key, each in arrays.items() if key not in texts}
     alone = len(arrays) == 1
-    name = next(iter(arrays)) if alone else first_of({key: key for key in numbers}, _PLACES)
+    name = next(iter(arrays)) if alone else key_of(numbers, _PLACES)
     array, counts = _numbered(arrays.get(name or "", np.zeros(0)))
     if array.shape[-2:] == _FREEMOCAP:
         array = array[..., :NUM_LANDMARKS, :]

@@ -31,7 +31,6 @@ from torchcss.io.keypoints.json_people import (
     PEOPLE,
     heads,
     is_joints,
-    key_of,
     listed,
     people_of,
     said_size,
@@ -59,6 +58,7 @@ from torchcss.io.keypoints.words import (
     TIMES,
     VIDEOS,
     first_of,
+    key_of,
     seconds_in,
     time_word,
 )
@@ -257,7 +257,7 @@ def _not_keypoints(path: Path, content: Any) -> KeypointError:
 def _frames(path: Path, content: Any, num_frames: int | None) -> list[list[Person]] | Frames:
     """The people of every frame, by what the file says of it, or in order."""
     if isinstance(content, dict):
-        if (inner := _frames_in(content)) is not None:
+        if (inner := first_of(content, _FRAMES, (list, dict))) is not None:
             return _frames(path, inner, num_frames)
         inner = content.get(key_of(content, (*PEOPLE, *JOINTS)) or "")
         if isinstance(inner, list) and 1 < len(inner) == num_frames and not is_joints(inner):
@@ -403,16 +403,13 @@ def _say_frames(entries: Sequence[Any]) -> bool:
     )
 
 
-def _frames_in(content: Mapping[str, Any]) -> list[Any] | dict[str, Any] | None:
-    """What a file has under a word for frames; None: it has no such word."""
-    return first_of({k: v for k, v in content.items() if isinstance(v, (list, dict))}, _FRAMES)
-
-
 def _size(content: Any) -> tuple[float, float] | None:
     """The size of the images that the file or its first frame names."""
-    inner = _frames_in(content) if isinstance(content, dict) else None
-    if inner is None and isinstance(content, dict) and key_of(content, (*PEOPLE, *JOINTS)) is None:
-        inner = content  # by picture
+    inner = None
+    if isinstance(content, dict):
+        inner = first_of(content, _FRAMES, (list, dict))
+        if inner is None and key_of(content, (*PEOPLE, *JOINTS)) is None:
+            inner = content  # by picture
     frames = [*inner.values()] if isinstance(inner, dict) else inner
     return said_size(content) or said_size(frames)
 

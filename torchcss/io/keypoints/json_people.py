@@ -11,7 +11,7 @@ Call `people_of`.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from torchcss.io.keypoints.words import (
     SIDES,
     SIZES,
     first_of,
+    key_of,
     plain_word,
 )
 from torchcss.joint_names import ALIASES, names_in
@@ -139,8 +140,7 @@ def _of_candidates(where: str, value: Mapping[str, Any]) -> list[Person]:
 
 def scored(people: list[Any], around: Mapping[str, Any]) -> list[Any]:
     """People, or frames of them, whose joints are pairs, with what stands beside all as scores."""
-    scores = first_of({k: each for k, each in around.items() if isinstance(each, list)}, SCORES)
-    joint: Any = people
+    scores, joint = first_of(around, SCORES, list), people
     while isinstance(joint, list) and isinstance(next(filter(None, joint), None), list):
         joint = next(filter(None, joint))
     if scores is None or len(joint) == 3 or len(scores) != len(people):
@@ -153,12 +153,6 @@ def scored(people: list[Any], around: Mapping[str, Any]) -> list[Any]:
     ):  # fmt: skip
         return people
     return [{"keypoints": each, "scores": own} for each, own in beside]
-
-
-def key_of(entry: Mapping[str, Any], words: Sequence[str]) -> str | None:
-    """The key that is the first of some words, such as `PEOPLE`, whatever stands under it."""
-    found = {plain_word(key): key for key in entry}
-    return next((found[word] for word in words if word in found), None)
 
 
 def _flat(value: list[Any]) -> bool:
@@ -207,7 +201,7 @@ def one_person(where: str, value: Any, around: Mapping[str, Any] | None = None) 
         return []
     if not isinstance(value, list):
         raise unexpected(KeypointError, where, "numbers", value)
-    scores = first_of({k: each for k, each in around.items() if isinstance(each, list)}, SCORES)
+    scores = first_of(around, SCORES, list)
     while isinstance(scores, list) and scores and isinstance(scores[0], list):
         scores = [each[0] if isinstance(each, list) and each else each for each in scores]
     if _flat(value) or value[0] is None:

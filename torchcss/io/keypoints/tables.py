@@ -265,8 +265,7 @@ def _head(head: object) -> str:
 def _heads_a_table(names: Iterable[str]) -> bool:
     """Whether these are columns: x and y of a named joint, or of one that a column names."""
     split = [_split(_head(name)) for name in names]
-    said = dict.fromkeys(names, 1)
-    named = bool(words.first_of(said, words.JOINT_WORDS) and words.first_of(said, _WHEN))
+    named = words.key_of(names, words.JOINT_WORDS) and words.key_of(names, _WHEN)
     own = [each[:2] for each in split if each is not None and (each[0] or named)]
     return any((joint, 0) in own and (joint, 1) in own for joint, _ in own)
 

@@ -98,10 +98,18 @@ def plain_word(word: str) -> str:
     return re.sub(r"[^a-z0-9#]", "", word.lower())
 
 
-def first_of(entry: Mapping[str, Value], words: Sequence[str]) -> Value | None:
-    """What stands under the first of some words that is there, and is not None."""
-    known = [(plain_word(key), value) for key, value in entry.items() if value is not None]
-    found = dict(reversed(known))
+def first_of(
+    entry: Mapping[str, Value], words: Sequence[str], kinds: type | tuple[type, ...] = object
+) -> Value | None:
+    """What stands under the first of some words that is there, and is of a kind and not None."""
+    items = reversed([*entry.items()])
+    found = {plain_word(k): v for k, v in items if v is not None and isinstance(v, kinds)}
+    return next((found[word] for word in words if word in found), None)
+
+
+def key_of(entry: Iterable[str], words: Sequence[str]) -> str | None:
+    """The key that is the first of some words, whatever stands under it."""
+    found = {plain_word(key): key for key in entry}
     return next((found[word] for word in words if word in found), None)
 
 
