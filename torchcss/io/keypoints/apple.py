@@ -26,8 +26,7 @@ def in_plain_words(people: People) -> People:
     names = people.names or ()
     if not {*_HIPS, *_SHOULDERS} <= {*names}:
         return people
-    frames = people.frames if isinstance(people.frames, list) else [*people.frames.values()]
-    everyone = [person.joints for frame in frames for person in frame]
+    everyone = [person.joints for frame in people.frames.values() for person in frame]
     if not everyone or any(len(joints) != len(names) for joints in everyone):
         return people
     joints = np.stack(everyone)
@@ -41,9 +40,7 @@ def in_plain_words(people: People) -> People:
     if not len(trunks) or (trunks[:, :2].mean(1) > trunks[:, 2:].mean(1)).mean() <= 0.5:
         return people
     return people._replace(
-        frames=[[_turned(person) for person in frame] for frame in frames]
-        if isinstance(people.frames, list)
-        else {key: [*map(_turned, frame)] for key, frame in people.frames.items()},
+        frames={key: [*map(_turned, frame)] for key, frame in people.frames.items()},
         report=[*report, "y counts upwards, as in Apple's Vision: turned over"],
     )
 

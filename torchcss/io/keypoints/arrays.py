@@ -96,32 +96,33 @@ def read_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> People:
     else:
         values = _people(name, array)
     if from_movenet := not landmarks and is_movenet(array, alone=alone):
-        values, kind = (
-            values[..., [1, 0, 2]],
-            "MoveNet's arrays, y before x, fractions of the image",
-        )
+        values = values[..., [1, 0, 2]]
+        kind = "MoveNet's arrays, y before x, fractions of the image"
     report = [f"format: {kind}"]
     if len(values) == 1 and values.shape[1] > _MOST_PEOPLE:
         values = values.swapaxes(0, 1)
         report.append(f"{name}: one person in {len(values)} frames, which are the second axis")
     values, told = _with_confidence(name, values, first_of(arrays, SCORES))
     tracks = _tracks(arrays.get("person_ids"), values)
-    people = [
-        [
+    counts = first_of(numbers, FRAMES) if counts is None else counts
+    in_order = counts is None or counts.shape != values.shape[:1] or not np.isfinite(counts).all()
+    keys = range(len(values)) if counts is None or in_order else counts.tolist()
+    frames: Frames = {}
+    for number, frame in zip(keys, values, strict=True):
+        frames.setdefault(int(number), []).extend(
             Person(joints, track)
             for joints, track in zip(frame, tracks, strict=True)
             if len(frame) == 1 or is_there(joints)
-        ]
-        for frame in values
-    ]
+        )
     size = _positive("image size", _size(numbers), 2)
     noise = _positive("relative_noise", arrays.get("relative_noise"), 1)
     texts = {key: each for key, each in texts.items() if each.shape == values.shape[2:3]}
     return People(
-        _counted(people, first_of(numbers, FRAMES) if counts is None else counts),
+        frames,
         _names(arrays.get("joint_names", first_of(texts, ORDER_NAMES)), values.shape[2]),
         [*report, told],
         LAYOUT if landmarks else None,
+        in_order,
         corner_fractions=from_movenet or landmarks,
         size_wh=None if size is None else (size[0], size[1]),
         relative_noise=noise[0] if noise else 1.0,
@@ -184,16 +185,6 @@ def is_movenet(array: np.ndarray, *, alone: bool = True) -> bool:
     trunk = np.abs(array[..., (5, 6), :2].mean(-2) - array[..., (11, 12), :2].mean(-2))
     upright = (trunk[..., 0] > trunk[..., 1])[trunk.any(-1)]
     return array.shape[1:-2] == (1,) or bool(len(upright) and upright.mean() > 0.5)
-
-
-def _counted(people: list[list[Person]], numbers: np.ndarray | None) -> list[list[Person]] | Frames:
-    """The people of every frame by its number, where the file has as many numbers as frames."""
-    if numbers is None or numbers.shape != (len(people),) or not np.isfinite(numbers).all():
-        return people
-    frames: Frames = {}
-    for number, frame in zip(numbers.tolist(), people, strict=True):
-        frames.setdefault(int(number), []).extend(frame)
-    return frames
 
 
 def _unfit(name: str, array: np.ndarray, expected: str) -> KeypointError:

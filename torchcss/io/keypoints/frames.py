@@ -54,8 +54,8 @@ def in_order(people: People, film: Film, report: list[str]) -> list[list[Person]
         KeypointError: If it is not clear which frames the entries are.
     """
     frames = people.frames
-    if isinstance(frames, list):
-        return frames
+    if people.in_order:
+        return [*frames.values()]
     if frames and all(isinstance(key, float) for key in frames):
         places = _by_time([float(key) for key in frames], film, report)
     elif (by_name := _by_name(frames, film, report)) is not None:

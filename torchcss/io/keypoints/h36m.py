@@ -23,7 +23,7 @@ import numpy as np
 
 from torchcss.errors import KeypointError
 from torchcss.files import array_header, refusing, unexpected
-from torchcss.io.keypoints.people import People, Person, screened
+from torchcss.io.keypoints.people import Frames, People, Person, screened
 from torchcss.joint_names import names_in
 
 _LAYOUTS = {
@@ -140,13 +140,14 @@ def read_h36m(path: Path, selection: str) -> People:
     layout = _LAYOUTS.get((str(metadata.get("layout_name")), points.shape[1]))
     sizes = metadata.get("video_metadata")
     size = _size(sizes.get(steps[0]) if isinstance(sizes, dict) else None)
-    return People([[Person(person)] for person in found], None, report, layout, size_wh=size)
+    frames: Frames = {index: [Person(person)] for index, person in enumerate(found)}
+    return People(frames, None, report, layout, in_order=True, size_wh=size)
 
 
 def _read_detections(path: Path) -> People:
     """Read what a detector found in one video, the people of every frame."""
     entries = np.asarray(_object(path, "keypoints"), dtype=object)
-    frames: list[list[Person]] = []
+    frames: Frames = {}
     for index, entry in enumerate(entries):
         person = entry[-1] if isinstance(entry, (list, np.ndarray)) and len(entry) else ()
         found = _numbers(person)
@@ -155,9 +156,10 @@ def _read_detections(path: Path) -> People:
                 f"frame {index}: expected numbers [people, 4, joints], got {list(found.shape)}"
             )
         rows = found.swapaxes(1, 2)[..., [0, 1, -1]] if found.size else ()
-        frames.append([Person(joints) for joints in rows])
+        frames[index] = [Person(joints) for joints in rows]
     size = _size(_metadata(path))
-    return People(frames, None, ["format: VideoPose3D's detections"], size_wh=size)
+    report = ["format: VideoPose3D's detections"]
+    return People(frames, None, report, in_order=True, size_wh=size)
 
 
 def _numbers(value: Any) -> np.ndarray:

@@ -138,8 +138,9 @@ def read_content(path: Path, content: Any, image_size_wh: Size, num_frames: int 
     frames = _frames(path, content, num_frames)
     in_order = isinstance(frames, list)
     found, own = united(dict(enumerate(frames)) if in_order else frames)
-    people = _people(name, found, own or _said_names(content, found), in_order=in_order)
-    return people._replace(first=1 if from_one else None, size_wh=_size(content))
+    people = _people(name, found, own or _said_names(content, found))
+    first = 1 if from_one else None
+    return people._replace(in_order=in_order, first=first, size_wh=_size(content))
 
 
 def read_folder(path: Path) -> People:
@@ -171,7 +172,7 @@ def read_folder(path: Path) -> People:
     return people._replace(whole=name != "labelme", size_wh=size, first=first)
 
 
-def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = False) -> People:
+def _people(name: str, frames: Frames, names: Names | None) -> People:
     """People of a format; 33 joints are MediaPipe's, whatever they are called or how ordered."""
     if keep_places([person.joints for person in people] for people in frames.values()):
         for people in frames.values():
@@ -180,8 +181,7 @@ def _people(name: str, frames: Frames, names: Names | None, *, in_order: bool = 
     report, layout = [f"format: {name}"], None
     if names is None and NUM_LANDMARKS in joint_counts(frames):
         report, layout = ["format: MediaPipe landmarks"], LAYOUT
-    found = list(frames.values()) if in_order else frames
-    return People(found, names, report, layout, corner_fractions=layout == LAYOUT)
+    return People(frames, names, report, layout, corner_fractions=layout == LAYOUT)
 
 
 def _plain_array(content: object) -> np.ndarray | None:
@@ -418,8 +418,8 @@ def _read_vitpose(path: Path, content: Mapping[str, Any]) -> People:
     """Read easy_ViTPose's: per frame people by number, their joints y, x, score."""
     names = content["skeleton"]
     names = tuple(map(str, names.values() if isinstance(names, dict) else listed(names)))
-    frames: list[list[Person]] = []
+    frames: Frames = {}
     for index, entry in enumerate(content["keypoints"]):
         people = people_of(f"{path}: frame {index}", entry)
-        frames.append([person._replace(joints=person.joints[:, [1, 0, 2]]) for person in people])
-    return People(frames, names or None, ["format: easy_ViTPose (y before x)"])
+        frames[index] = [person._replace(joints=person.joints[:, [1, 0, 2]]) for person in people]
+    return People(frames, names or None, ["format: easy_ViTPose (y before x)"], in_order=True)

@@ -56,11 +56,12 @@ class People(NamedTuple):
     """All detections of a file.
 
     Attributes:
-        frames: The people of every frame in order; or by number, time or picture, where the file
-            says so and may leave out frames in which nobody is seen.
+        frames: The people of every frame, by number, time or picture.
         names: The file's own joint names, or None where it has only an order.
         report: Lines for the user.
         layout: The layout, where the format says it.
+        in_order: The frames are those of the video, one after the other; else the file says which
+            they are, and may leave out some in which nobody is seen.
         corner_fractions: Coordinates are pixels, or fractions of the image from its corner.
         first: The number of the first frame, where the format says it.
         whole: All frames are there that were looked at: the lowest number is the first frame, but
@@ -71,10 +72,11 @@ class People(NamedTuple):
         by_hand: Somebody typed the names, so that one that is not known is an error.
     """
 
-    frames: list[list[Person]] | Frames
+    frames: Frames
     names: Names | None
     report: list[str]
     layout: str | None = None
+    in_order: bool = False
     corner_fractions: bool = False
     first: int | None = None
     whole: bool = False

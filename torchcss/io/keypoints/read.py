@@ -210,10 +210,10 @@ def _person(
     """Who is followed, checked and in pixels."""
     first_frame, _, image_size_wh = whom
     report = list(people.report)
-    if isinstance(people.frames, list) and len(people.frames) == 1:
-        alone = people.frames[0]
+    if people.in_order and len(people.frames) == 1:
+        (alone,) = people.frames.values()
         if 1 < len(alone) == film.num_frames:
-            people = people._replace(frames=[[person] for person in alone])
+            people = people._replace(frames={n: [person] for n, person in enumerate(alone)})
             report.append("as many people in one frame as the video has frames: one in each")
     everyone = in_order(people, film, report)
     everyone = [[p for p in frame if is_there(p.joints)] for frame in everyone]

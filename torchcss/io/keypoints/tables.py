@@ -147,15 +147,14 @@ def people_of_rows(rows: list[Row]) -> People:
         frames = in_seconds(columns.time, frames)
     frames, joints = _without_hands(frames, joints, report)
     frames, names = reordered(frames, joints)
-    in_order = columns.frame is None and columns.joint is None
-    people = list(frames.values()) if in_order else frames
+    people = People(frames, names, report, in_order=columns.frame is None and columns.joint is None)
     if names is None and joint_counts(frames) == {NUM_LANDMARKS}:
         report.insert(0, "format: CSV of MediaPipe's landmarks")
-        return People(people, None, report, LAYOUT, corner_fractions=True)
+        return people._replace(layout=LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
     size = _said_size(heading, rows[1:])
-    return People(people, names, report, first=first, by_hand=heading == [*_HAND], size_wh=size)
+    return people._replace(first=first, by_hand=heading == [*_HAND], size_wh=size)
 
 
 def _of_the_body(rows: list[Row], joint: int, report: list[str]) -> list[Row]:
