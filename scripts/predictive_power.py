@@ -24,7 +24,7 @@ them: with too large a power modes are too narrow and the leading one is too sur
 The table has a row for each clip: its scores less that with the reference power (`--reference`),
 its best power, the power that is best for all other clips, and the score with that less those with
 its own and with the reference; then the mean over the clips and its standard error. Runs are kept
-in `--runs`; those that are there already are not made again.
+in `--runs`; those that are there already go on where they ended.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchcss import Run, Settings, track_video
+from torchcss.app.track import TrackOptions
 from torchcss.body.bases import pose_track
 from torchcss.body.uncertainty import joint_covariance
 from torchcss.cli.options import SettingsOptions
@@ -106,8 +107,6 @@ def name_of(clip: Path) -> str:
 def track(config: Config, clip: Path, power: float) -> Run:
     """The run of a clip without the keypoints that are kept back."""
     folder = config.runs / name_of(clip) / f"{power:g}"
-    if (folder / "summary.json").exists():
-        return Run.open(folder)
     with np.load(clip / "keypoints2d.npz") as file:
         arrays = dict(file)
     names = tuple(canonical_joint_name(str(name)) or "" for name in arrays["joint_names"])
@@ -123,6 +122,7 @@ def track(config: Config, clip: Path, power: float) -> Run:
         out=folder,
         settings=replace(config.tracking, likelihood_power=power),
         stop=config.frames,
+        options=TrackOptions(resume=True),
     )
 
 

@@ -30,6 +30,7 @@ def test_a_clip_is_tracked_without_some_keypoints(script: ModuleType, tmp_path: 
         runs=tmp_path / "runs",
         tracking=replace(script.TRACKING, samples=10, modes=2),
     )
+    script.main(replace(config, frames=2))  # as if interrupted
     (row,) = script.main(config)["rows"]
     assert row["clip"] == "clips/one"
     assert row["keypoints"] == 2 * 4  # two frames, an elbow, a wrist, a knee and an ankle
