@@ -112,15 +112,7 @@ def crop(clip: Clip, _: np.random.Generator) -> Clip:
     height = clip.images.shape[1]
     end = int(np.nanmedian(clip.keypoints[:, hips, 1]) + 0.05 * height) // 2 * 2
     end = min(max(end, 2), height)
-    own = clip.camera
-    camera = Camera(
-        own.K,
-        (own.image_size_wh[0], end),
-        distortion=own.distortion,
-        R_camera_world=own.R_camera_world,
-        t_camera_world=own.t_camera_world,
-        name=own.name,
-    )
+    camera = clip.camera.cropped(0, 0, clip.camera.image_size_wh[0], end)
     below = clip.keypoints[..., 1] > end
     return replace(clip.without(below), images=clip.images[:, :end], camera=camera)
 

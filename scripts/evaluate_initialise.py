@@ -36,10 +36,11 @@ from torchcss.initialise.multi_start import SINGLE_START, StartSearch
 from torchcss.initialise.options import LEAST_JOINTS, InitialiseOptions
 from torchcss.io.cameras import read_camera
 from torchcss.io.keypoints.read import read_keypoints
-from torchcss.joint_names import LIMB_JOINTS, canonical_joint_name
+from torchcss.joint_names import LIMB_JOINTS
 from torchcss.robust import Quadratic
 from torchcss.studies.metrics import pa_mpjpe_mm, root_aligned_mpjpe_mm
 from torchcss.studies.random_person import RandomPerson, person_coverage, random_person
+from torchcss.studies.sequences import read_reference
 from torchcss.types import Keypoints, Vector
 from torchcss.vision.camera import Camera
 
@@ -143,9 +144,8 @@ def cases(config: Config, condition: str) -> Iterator[tuple[int, Case]]:
     folder, video, file = CLIPS[condition]
     camera = read_camera(config.data / folder / "cameras.json", video=video)
     keypoints = read_keypoints(config.data / folder / file, image_size_wh=camera.image_size_wh)
-    reference = np.load(config.data / folder / "reference3d.npz")
-    names = [canonical_joint_name(str(name)) for name in reference["joint_names"]]
-    joints = reference["joints"][:, [names.index(name) for name in LIMB_JOINTS]]
+    places, names = read_reference(config.data / folder / "reference3d.npz")
+    joints = places[:, [names.index(name) for name in LIMB_JOINTS]]
     at = {name: joints[:, i] for i, name in enumerate(LIMB_JOINTS)}
     lengths = {
         limb: float(np.nanmedian([np.linalg.norm(at[f"{side}_{a}"] - at[f"{side}_{b}"], axis=-1)

@@ -30,7 +30,6 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from torchcss.body.model import BodyModel
 from torchcss.cli.options import SettingsOptions
 from torchcss.cost.frame import NOTHING_KNOWN, FrameCosts, Learnt
 from torchcss.errors import ConfigurationError
@@ -41,7 +40,7 @@ from torchcss.initialise.result import Initialisation
 from torchcss.initialise.view import CameraView
 from torchcss.io.video import VideoReader
 from torchcss.studies.metrics import mpjpe_mm
-from torchcss.studies.render.sequences import arm_sequence
+from torchcss.studies.render.sequences import SyntheticSequence, arm_sequence
 from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.presets import PRESETS
 from torchcss.tracking.session import TrackingSession
@@ -52,7 +51,6 @@ from torchcss.tracking.settings import (
     make_extractor,
 )
 from torchcss.types import Frame
-from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 
 OPTIMISER = TrustRegionNewton(max_steps=30, tolerance=1e-6)
@@ -100,25 +98,6 @@ class Config:
     """JSON file to write."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Truth:
-    """A sequence with true states.
-
-    Attributes:
-        body: The body on its base.
-        camera: Camera of the full-size images.
-        images: The frames.
-        states: State of every frame.
-        interval: Seconds between frames.
-    """
-
-    body: BodyModel
-    camera: Camera
-    images: list[np.ndarray]
-    states: Float[Tensor, "t n"]
-    interval: float
-
-
 def main(config: Config) -> dict[str, Any]:
     """Learn, measure, print, write; return what is written."""
     if "segmentation" in config.learnt:
@@ -160,24 +139,20 @@ def main(config: Config) -> dict[str, Any]:
     return finish(config.out, report, table)
 
 
-def load(name: str, num_frames: int) -> Truth:
+def load(name: str, num_frames: int) -> SyntheticSequence:
     """A sequence by its name."""
     kind, _, seed = name.partition(":")
     if kind == "demo" and seed.isdigit():
-        demo = arm_sequence(
-            generator=torch.Generator().manual_seed(int(seed)), num_frames=num_frames
-        )
-        return Truth(
-            body=demo.body, camera=demo.camera, images=list(demo.frames), states=demo.states,
-            interval=1 / demo.frame_rate,
-        )  # fmt: skip
+        generator = torch.Generator().manual_seed(int(seed))
+        return arm_sequence(generator=generator, num_frames=num_frames)
     sequence = read_sequence(Path(name))
     if sequence.truth is None:
         raise ConfigurationError(f"{name}: has no true states; expected demo:SEED or such a folder")
     images = [frame.image for frame in VideoReader(sequence.video, stop=num_frames)]
-    return Truth(
-        body=sequence.truth.body, camera=sequence.camera, images=images,
-        states=sequence.truth.states[: len(images)], interval=1 / sequence.frame_rate,
+    states = sequence.truth.states[: len(images)]
+    return SyntheticSequence(
+        frames=images, frame_rate=sequence.frame_rate, camera=sequence.camera,
+        body=sequence.truth.body, states=states,
     )  # fmt: skip
 
 
@@ -189,18 +164,18 @@ class Lesson:
         settings: Terms and sizes.
     """
 
-    def __init__(self, truth: Truth, settings: Settings) -> None:
+    def __init__(self, truth: SyntheticSequence, settings: Settings) -> None:
         extractor, body = make_extractor(settings), truth.body
-        self.truth = truth
+        self.truth, self.interval = truth, 1 / truth.frame_rate
         self.costs = FrameCosts(
             body, extractor.working_camera(truth.camera), make_choice(settings, 1.0),
-            frame_interval=truth.interval, boundary_emphasis=boundary_emphasis(settings),
+            frame_interval=self.interval, boundary_emphasis=boundary_emphasis(settings),
         )  # fmt: skip
-        self.joints = body.pose(truth.states).joints
+        self.joints = truth.joints_world
         self.features: list[FrameFeatures] = []
         self.known: list[Learnt] = [NOTHING_KNOWN]
         last = None
-        for index, image in enumerate(tqdm(truth.images, unit="frame", desc="features")):
+        for index, image in enumerate(tqdm(truth.frames, unit="frame", desc="features")):
             self.features.append(extractor(image, last))
             pose = truth.states[index : index + 1]
             self.known.append(self.costs.learn(self.known[-1], self.features[-1], body, pose))
@@ -216,7 +191,7 @@ class Lesson:
             the weights, which may change in between.
         """
         body, states = self.truth.body, self.truth.states
-        deviation = config.noise * body.motion_rate * self.truth.interval
+        deviation = config.noise * body.motion_rate * self.interval
         size = (config.starts, body.num_parameters)
 
         def about(state: Tensor) -> Tensor:
@@ -277,11 +252,11 @@ def learn(
 
 
 def tracked_error(
-    truth: Truth, settings: Settings, weights: Mapping[str, float]
+    truth: SyntheticSequence, settings: Settings, weights: Mapping[str, float]
 ) -> dict[str, float]:
     """Mean error of a whole track from the true first pose, of the best mode and of all, mm."""
     settings = replace(settings, weights=dict(weights))
-    n = truth.body.num_parameters
+    n, interval = truth.body.num_parameters, 1 / truth.frame_rate
     mixture = GaussianMixture(
         truth.states[:1], 0.01 * torch.eye(n).double()[None], torch.zeros(1).double()
     )
@@ -289,11 +264,11 @@ def tracked_error(
         settings,
         Initialisation(truth.body, mixture, torch.zeros(1).double(), ()),
         [CameraView(truth.camera)],
-        frame_interval=truth.interval,
+        frame_interval=interval,
     )
     best, of_modes = [], []
-    frames = (Frame(i, i * truth.interval, image) for i, image in enumerate(truth.images))
-    for frame in session.track(tqdm(frames, total=len(truth.images), unit="frame")):
+    frames = (Frame(i, i * interval, image) for i, image in enumerate(truth.frames))
+    for frame in session.track(tqdm(frames, total=len(truth.frames), unit="frame")):
         joints = truth.body.pose(truth.states[frame.frame.index]).joints
         error = mpjpe_mm(frame.joints_world, joints)
         best.append(error[0])

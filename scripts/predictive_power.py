@@ -38,6 +38,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from common import Table, finish, start
+from degrade_clips import twin
 from evaluate_posterior import find_clips
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -88,15 +89,10 @@ class Config:
 def kept_back(names: tuple[str, ...], num_frames: int) -> Bool[np.ndarray, "t j"]:
     """Which keypoints the tracker does not see, by frame and the joints' names."""
     gone = np.zeros((num_frames, len(names)), bool)
-    first, other = np.isin(names, KEPT_BACK), np.isin(names, opposite(KEPT_BACK))
+    first, other = np.isin(names, KEPT_BACK), np.isin(names, [*map(twin, KEPT_BACK)])
     block = np.arange(num_frames - 1) // BLOCK
     gone[1:] = np.where((block % 2 == 0)[:, None], first, other)
     return gone
-
-
-def opposite(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The same joints of the other side."""
-    return tuple(("r" if name[0] == "l" else "l") + name[1:] for name in names)
 
 
 def name_of(clip: Path) -> str:
@@ -180,7 +176,7 @@ def predict(run: Run, clip: Path) -> Prediction:
     size = camera.image_size_wh
     keypoints = read_keypoints(clip / "keypoints2d.npz", image_size_wh=size)
     known = {*keypoints.names} & {*found.joint_names}
-    joints = [name for name in PREDICTED + opposite(PREDICTED) if name in known]
+    joints = [name for name in (*PREDICTED, *map(twin, PREDICTED)) if name in known]
     here = [found.joint_names.index(name) for name in joints]
     there = [keypoints.names.index(name) for name in joints]
     gone = torch.from_numpy(kept_back(tuple(joints), len(keypoints.positions)))[found.frames]
