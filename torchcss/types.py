@@ -57,6 +57,11 @@ Items = Int[Tensor, " m"]
 """Which items, by index."""
 
 
+def as_array(tensor: Tensor) -> np.ndarray:
+    """A tensor's numbers for NumPy, float64."""
+    return tensor.double().numpy(force=True)
+
+
 class LocalModel(NamedTuple):
     """A cost and its first two derivatives at a state; the quadratic model of eq. 11 and 12 [IJRR].
 

@@ -14,6 +14,7 @@ from torchcss.app.recorder import Picture, modes_of
 from torchcss.io.export.selection import camera_up, up_axis
 from torchcss.show.viewer import ShownFrame, Viewer, close_recording, open_recording
 from torchcss.tracking.session import Posterior
+from torchcss.types import as_array
 
 
 class LiveViewer:
@@ -52,7 +53,7 @@ class LiveViewer:
             picture: How it looks.
         """
         if self._viewer is None:
-            joints = frame.joints_world[:1].double().cpu().numpy()
+            joints = as_array(frame.joints_world[:1])
             upward = camera_up(picture.camera)
             up, _ = up_axis(frame.body.joint_names, joints, np.eye(4)[None], upward)
             self._viewer = Viewer(self._recording, frame.body, camera=picture.camera, up=up)

@@ -46,6 +46,7 @@ from torchcss.files import StrPath, load_arrays, naming, save_arrays
 from torchcss.inference.mixture import GaussianMixture
 from torchcss.initialise.result import Initialisation
 from torchcss.io.track_body import PARAMETER_NUMBERS, set_numbers
+from torchcss.types import as_array
 from torchcss.vision.camera import Camera
 
 BODY_VERSION = 1
@@ -92,7 +93,7 @@ def write_fitted_body(path: StrPath, found: Initialisation, camera: Camera) -> N
         "state_names": np.array(body.state_names, dtype=np.str_),
         "neighbours": np.array(body.neighbours, dtype=np.str_).reshape(-1, 2),
     }
-    arrays = {name: tensor.detach().double().cpu().numpy() for name, tensor in tensors.items()}
+    arrays = {name: as_array(tensor) for name, tensor in tensors.items()}
     save_arrays(Path(path), {**about, **arrays})
 
 

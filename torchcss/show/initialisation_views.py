@@ -45,7 +45,7 @@ def draw_hypotheses(
         camera: The camera, which gives the first direction.
         cost: Their costs, for the legend.
     """
-    joints = camera.to_camera_frame(body.pose(x).joints).detach().cpu().numpy()
+    joints = camera.to_camera_frame(body.pose(x).joints).numpy(force=True)
     middle = joints[:1].mean(axis=1, keepdims=True)
     distance = float(middle[0, 0, 2])
     # In perspective, as in the picture, the hypotheses coincide.

@@ -41,6 +41,7 @@ from torchcss.show.track_plots import (
     side_view_figure,
     tidy,
 )
+from torchcss.types import as_array
 from torchcss.vision.camera import Camera
 
 SHOWN_JOINTS = (
@@ -126,8 +127,8 @@ def joints_figure(track: Track, *, camera: Camera | None = None) -> Figure:
     places, labels = track.joints_world, ("world x", "world y", "world z")
     if camera is not None:
         # Up is minus the camera's y.
-        turn = camera.R_camera_world.double().cpu().numpy() * [[1], [-1], [1]]
-        shift = camera.t_camera_world.double().cpu().numpy() * [1, -1, 1]
+        turn = as_array(camera.R_camera_world) * [[1], [-1], [1]]
+        shift = as_array(camera.t_camera_world) * [1, -1, 1]
         places = places @ turn.T + shift
         spread = turn @ spread @ turn.T
         labels = ("right in the picture", "up in the picture", "away from the camera")

@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
-from torch import Tensor
 from tqdm import tqdm
 
 from torchcss.body.bases import on_origin, pose_track
@@ -50,6 +49,7 @@ from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_pictures import pictures_of
 from torchcss.show.track_plots import EXPLANATION_M, bones_of, check_not_empty, count_apart
 from torchcss.show.viewer_layout import layout, rerun, world_axes
+from torchcss.types import as_array
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
@@ -139,10 +139,6 @@ def shown_frames(run: Run, *, anew: bool = False) -> Iterator[ShownFrame]:
         modes = run.track.modes(row)
         lost = changes.get(modes.frame, "lost" if lost else "found") == "lost"
         yield ShownFrame(modes, next(pictures, (row, None))[1], lost)
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().double().cpu().numpy()
 
 
 def has_display() -> bool:
@@ -251,8 +247,8 @@ class Viewer:
         self._up = up
         self._events = events
         surface = body.mesh(_RINGS, _MERIDIANS)
-        self._vertices = _array(surface.points.flatten(1, 2))
-        self._normals = _array(surface.normals.flatten(1, 2))
+        self._vertices = as_array(surface.points.flatten(1, 2))
+        self._normals = as_array(surface.normals.flatten(1, 2))
         self._faces = grid_faces(_RINGS, _MERIDIANS).numpy()
         self._known = 0
         self._shown = 0
@@ -267,9 +263,9 @@ class Viewer:
         modes = frame.modes
         pose = pose_track(self._body, modes.state, modes.base_transform)
         weight = modes.log_weight.softmax(0)
-        joints, weight, cost = map(_array, (pose.joints, weight, modes.cost))
-        spread = _array(joint_covariance(self._body, pose, modes.covariance))
-        rotation, centre = map(_array, self._body.part_poses(pose))
+        joints, weight, cost = map(as_array, (pose.joints, weight, modes.cost))
+        spread = as_array(joint_covariance(self._body, pose, modes.covariance))
+        rotation, centre = map(as_array, self._body.part_poses(pose))
         if not self._known:
             self._begin(joints[0])
         self._recording.set_time("frame", sequence=modes.frame)
@@ -327,9 +323,9 @@ class Viewer:
 
     def _log_camera(self, camera: Camera, joints: Float[np.ndarray, "j 3"]) -> None:
         camera = _reduced(camera)
-        turn = _array(camera.R_camera_world).T
-        centre = _array(camera.centre_world)
-        K = _array(camera.K).copy()
+        turn = as_array(camera.R_camera_world).T
+        centre = as_array(camera.centre_world)
+        K = as_array(camera.K).copy()
         K[:2, 2] += 0.5  # the viewer counts pixels from the picture's corner, we from a centre
         self._log(
             "world/camera", self._rr.Transform3D(translation=centre, mat3x3=turn), static=True

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from torchcss.errors import optional_package
+from torchcss.types import as_array
 from torchcss.vision.camera import Camera
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def viewpoint(
     if camera is None:
         towards = np.roll(vertical, 1)
     else:
-        towards = camera.centre_world.double().cpu().numpy() - middle
+        towards = as_array(camera.centre_world) - middle
         towards -= (towards @ vertical) * vertical
     length = np.linalg.norm(towards)
     towards = towards / length if length > 0 else np.roll(vertical, 1)

@@ -70,7 +70,7 @@ from torchcss.studies.metrics import (
 )
 from torchcss.studies.sequences import RecordedSequence, common_name, read_reference
 from torchcss.tracking.session import Posterior
-from torchcss.types import Frame, Vector, frozen
+from torchcss.types import Frame, Vector, as_array, frozen
 from torchcss.vision.camera import Camera
 
 ARM_LOST_MM = 150.0
@@ -307,7 +307,7 @@ class Evaluator:
         body, number = tracked.body, tracked.frame.index
         mixture = tracked.state.mixture._replace(covariance=tracked.covariance)
         count = len(self.compared)
-        joints = tracked.joints_world[:, self._column].double().cpu().numpy()
+        joints = as_array(tracked.joints_world[:, self._column])
         reference = self._reference[number]
         absolute = absolute_errors_mm(joints, reference)[:, :count]
         aligned = absolute
@@ -318,7 +318,7 @@ class Evaluator:
             drawn = silhouette(body, mixture.mean[0], sequence.camera)
             overlap = float(mask_overlap(drawn, sequence.mask[number]))
         error = _mean(aligned[0])
-        weight = mixture.weight.double().cpu().numpy()
+        weight = as_array(mixture.weight)
         along, across = self._directions(joints[0], reference)
         outside, at_bound = _against_limits(body, mixture.mean[0])
         within = region_probability(
@@ -362,7 +362,7 @@ class Evaluator:
         away, known = away[:count], np.isfinite(reference[:count]).all(-1)
         if not known.any() or not np.isfinite(away[known]).all():
             return math.nan, math.nan
-        centre = self.sequence.camera.centre_world.double().cpu().numpy()
+        centre = as_array(self.sequence.camera.centre_world)
         sight = reference[:count][known].mean(0) - centre
         along = away[known] @ (sight / np.linalg.norm(sight))
         squared = (away[known] ** 2).sum(-1) - along**2

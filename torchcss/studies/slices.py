@@ -39,7 +39,7 @@ from torch import Tensor
 
 from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.linalg import squared_mahalanobis
-from torchcss.types import Bounds, Vector
+from torchcss.types import Bounds, Vector, as_array
 
 PROMINENCE = 0.02
 """Share of a slice's range above which a minimum counts."""
@@ -283,7 +283,7 @@ def sample_slice(
 
     def evaluate(offsets: SampledCurve) -> dict[str, SampledCurve]:
         costs = terms(line.states(offsets))
-        curves = {name: cost.detach().cpu().double().numpy() for name, cost in costs.items()}
+        curves = {name: as_array(cost) for name, cost in costs.items()}
         return {**curves, "sum": np.sum(list(curves.values()), axis=0)}
 
     fine_offsets = np.linspace(low, high, 2 * num_samples - 1)

@@ -27,7 +27,7 @@ from torchcss.body.uncertainty import Held
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.tracks import Track
 from torchcss.io.video import VideoReader, usual_step
-from torchcss.types import TIME_ROUNDING
+from torchcss.types import TIME_ROUNDING, as_array
 from torchcss.vision.camera import Camera
 
 DEFAULT_FRAME_RATE = 25.0
@@ -337,4 +337,4 @@ def _rate_of_video(track: Track) -> float | None:
 
 def camera_up(camera: Camera | None) -> np.ndarray | None:
     """The direction in the world that is up in the picture; None without a camera."""
-    return None if camera is None else -camera.R_camera_world[1].double().cpu().numpy()
+    return None if camera is None else -as_array(camera.R_camera_world[1])
