@@ -49,8 +49,7 @@ def output_error(path: Path, error: Exception) -> OutputError:
         path: The file or folder that was wanted.
         error: What the operating system, or FFmpeg on its behalf, reported.
     """
-    reason = one_line(getattr(error, "strerror", None) or error)
-    other = f"{reason}; choose another folder with --out"
+    other = f"{one_line(error)}; choose another folder with --out"
     advice = _ADVICE.get(getattr(error, "errno", None) or 0, other)
     return OutputError(f"{path}: cannot be written: {advice}")
 
@@ -333,8 +332,9 @@ def unexpected(
 
 
 def one_line(error: BaseException | str) -> str:
-    """What an exception says, in one short line."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
+    """What an exception says, in one short line; of the system's without number and path."""
+    said = getattr(error, "strerror", None) or error
+    return " ".join(str(said).split())[:120] or type(error).__name__
 
 
 _SHORT = reprlib.Repr()

@@ -100,17 +100,14 @@ def load_camera(
     Raises:
         CameraError: If the file is missing or malformed, or which camera is meant is not clear.
     """
-    name, entry = _chosen(Path(path), name, video)
-    where = f"{path}: camera {name!r}"
-    numbers = _checked(entry, where)
-    if (why := _unlike_a_pinhole(numbers.distortion, entry.fisheye)) is not None:
+    where, name, entry = _chosen(Path(path), name, video)
+    if (why := _unlike_a_pinhole(entry.distortion, entry.fisheye)) is not None:
         given, lens = (shlex.quote(str(each)) for each in (video or "VIDEO", path))
         raise CameraError(
             f"{where}: {why} is not supported: torchcss undistort {given} --camera {lens} "
             "--out FOLDER makes straight pictures, and their camera and keypoints"
         )
-    distortion = numbers.distortion[:5]
-    return _loaded(name, entry, numbers._replace(distortion=distortion), path)
+    return _loaded(name, entry._replace(distortion=entry.distortion[:5]), path)
 
 
 def load_lens(
@@ -132,63 +129,52 @@ def load_lens(
     Raises:
         CameraError: As for `load_camera`, or the lens is of a model that is not known.
     """
-    name, entry = _chosen(Path(path), name, video)
-    where = f"{path}: camera {name!r}"
-    numbers = _checked(entry, where)
+    where, name, entry = _chosen(Path(path), name, video)
     is_fisheye = entry.fisheye == "equidistant"
     most = MOST_COEFFICIENTS[is_fisheye]
-    coefficients = numbers.distortion
+    coefficients = entry.distortion
     if coefficients[most:].any() or not np.isfinite(coefficients).all():
         raise unexpected(
             CameraError, f"{where}: distortion", f"at most {most} numbers", coefficients.tolist()
         )
     coefficients = coefficients[:most]
-    numbers = numbers._replace(distortion=np.zeros(4))
-    _loaded(name, entry, numbers, path)  # which checks K
+    entry = entry._replace(distortion=np.zeros(4))
+    _loaded(name, entry, path)  # which checks K
     mirror = entry.fisheye if isinstance(entry.fisheye, Mirror) else None
-    lens = Lens(numbers.K, tuple(coefficients.tolist()), is_fisheye, mirror)
-    size = (int(numbers.size[0]), int(numbers.size[1]))
-    straight = numbers._replace(K=lens.straightened_K(size, fov))
-    return _loaded(name, entry, straight, path), lens
+    lens = Lens(entry.K, tuple(coefficients.tolist()), is_fisheye, mirror)
+    straight = entry._replace(K=lens.straightened_K(entry.image_size_wh, fov))
+    return _loaded(name, straight, path), lens
 
 
-class _Numbers(NamedTuple):
-    """The numbers of an entry, checked."""
+def _chosen(path: Path, name: str | None, video: StrPath | None) -> tuple[str, str, Entry]:
+    """The camera that is meant: what messages call it, its name, and its numbers, checked.
 
-    K: np.ndarray
-    size: np.ndarray
-    distortion: np.ndarray
-    rotation: np.ndarray | None
-    translation: np.ndarray | None
-
-
-def _chosen(path: Path, name: str | None, video: StrPath | None) -> tuple[str, Entry]:
-    """The camera that is meant, with the size of the video if it has none of its own."""
+    It has the size of the video if it has none of its own.
+    """
     entries = read_entries(path)
     name = _choose(path, entries, name, None if video is None else Path(video))
-    entry = entries[name]
+    entry, where = entries[name], f"{path}: camera {name!r}"
     if entry.fisheye not in (False, "equidistant") and not isinstance(entry.fisheye, Mirror):
         what = "an inverse model of a" if entry.fisheye == "inverse" else "this model of a fisheye"
         raise CameraError(
-            f"{path}: camera {name!r}: {what} lens is not supported; undistort the video by the "
+            f"{where}: {what} lens is not supported; undistort the video by the "
             "program that calibrated it, and give the camera of the undistorted images"
         )
     if entry.image_size_wh is None and video is not None and Path(video).exists():
         info = VideoReader(video).info
         entry = entry._replace(image_size_wh=[info.width, info.height])
-    return name, entry
+    return where, name, _checked(entry, where)
 
 
-def _loaded(name: str, entry: Entry, numbers: _Numbers, path: StrPath) -> LoadedCamera:
+def _loaded(name: str, entry: Entry, path: StrPath) -> LoadedCamera:
     """The camera in the frame that its file allows, and what is said of it."""
-    K, size, distortion, rotation, translation = numbers
     try:
         camera = Camera(
-            K,
-            (int(size[0]), int(size[1])),
-            distortion=distortion,
-            R_camera_world=rotation,
-            t_camera_world=translation,
+            entry.K,
+            entry.image_size_wh,
+            distortion=entry.distortion,
+            R_camera_world=entry.rotation,
+            t_camera_world=entry.translation,
             name=name,
         )
     except CameraError as error:
@@ -202,8 +188,8 @@ def _loaded(name: str, entry: Entry, numbers: _Numbers, path: StrPath) -> Loaded
     return LoadedCamera(camera, note is None, said or None)
 
 
-def _checked(entry: Entry, where: str) -> _Numbers:
-    """The numbers of an entry, K and rotation as matrices, the distortion in a row of four or more.
+def _checked(entry: Entry, where: str) -> Entry:
+    """An entry with arrays, K and rotation as matrices, the distortion in a row of four or more.
 
     Raises:
         CameraError: If something is missing or no number.
@@ -237,8 +223,13 @@ def _checked(entry: Entry, where: str) -> _Numbers:
         raise CameraError(f"{where}: distortion: expected k1 k2 p1 p2 [k3], found 3 numbers")
     # Simpler models have k1 and k2 alone.
     distortion = np.pad(distortion, (0, max(0, 4 - len(distortion))))
-    translation = None if translation is None else translation.ravel()
-    return _Numbers(K, size, distortion, rotation, translation)
+    return entry._replace(
+        K=K,
+        image_size_wh=(int(size[0]), int(size[1])),
+        distortion=distortion,
+        rotation=rotation,
+        translation=None if translation is None else translation.ravel(),
+    )
 
 
 def _unlike_a_pinhole(distortion: np.ndarray, fisheye: object) -> str | None:

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import VideoError
-from torchcss.files import StrPath, one_line
+from torchcss.files import StrPath, refusing
 
 
 def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
@@ -35,28 +35,23 @@ def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         VideoError: If the file is missing, damaged or no image.
     """
-    try:
-        with Image.open(path) as opened:
-            picture = ImageOps.exif_transpose(opened)
-            if picture.mode == "F":
-                raise VideoError(
-                    f"{path}: floating-point images have no fixed range; expected 8 or 16 bit"
-                )
-            if picture.mode.startswith("I"):
-                values = np.asarray(picture)
-                grey = (values.astype(np.int64).clip(0, 65535) >> 8).astype(np.uint8)
-                return np.repeat(grey[:, :, None], 3, axis=2)
-            if "A" in picture.getbands() or "transparency" in picture.info:
-                picture = picture.convert("RGBA")
-                black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
-                picture = Image.alpha_composite(black, picture)
-            return np.array(picture.convert("RGB"))
-    except VideoError:
-        raise
-    except Exception as error:  # Pillow's decoders raise whatever their format's damage leads to
-        raise VideoError(
-            f"{path}: not an image that can be read ({library_reason(error)}); get a complete copy"
-        ) from error
+    what, advice = f"{path}: not an image that can be read", "get a complete copy"
+    # Pillow's decoders raise whatever their format's damage leads to.
+    with refusing(VideoError, what, advice=advice), Image.open(path) as opened:
+        picture = ImageOps.exif_transpose(opened)
+        if picture.mode == "F":
+            raise VideoError(
+                f"{path}: floating-point images have no fixed range; expected 8 or 16 bit"
+            )
+        if picture.mode.startswith("I"):
+            values = np.asarray(picture)
+            grey = (values.astype(np.int64).clip(0, 65535) >> 8).astype(np.uint8)
+            return np.repeat(grey[:, :, None], 3, axis=2)
+        if "A" in picture.getbands() or "transparency" in picture.info:
+            picture = picture.convert("RGBA")
+            black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
+            picture = Image.alpha_composite(black, picture)
+        return np.array(picture.convert("RGB"))
 
 
 def size_at_beginning(path: Path) -> tuple[int, int] | None:
@@ -131,8 +126,3 @@ def several_kinds(names: Sequence[str]) -> str | None:
         return None
     told = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     return f"pictures of several kinds, {told}: all are taken, in the order of their names"
-
-
-def library_reason(error: Exception) -> str:
-    """One short line of what a library said."""
-    return one_line(getattr(error, "strerror", None) or error)

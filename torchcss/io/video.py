@@ -30,7 +30,7 @@ from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
-from torchcss.files import StrPath, naming, output_error, temporary_name
+from torchcss.files import StrPath, naming, one_line, output_error, refusing, temporary_name
 from torchcss.io.containers import (
     Damage,
     av_errors,
@@ -41,7 +41,6 @@ from torchcss.io.containers import (
     whole_pictures,
 )
 from torchcss.io.pictures import (
-    library_reason,
     natural_order,
     num_pictures,
     read_image,
@@ -155,11 +154,8 @@ class VideoReader:
     @property
     def num_selected(self) -> int | None:
         """How many frames an iteration yields, or None where the container does not tell."""
-        num_frames = self.info.num_frames
-        if num_frames is None:
-            return None
-        stop = num_frames if self._stop is None else min(self._stop, num_frames)
-        return len(range(self._start, stop, self._stride))
+        count = self.info.num_frames
+        return None if count is None else len(range(count)[self._start : self._stop : self._stride])
 
     @property
     def image_names(self) -> list[str] | None:
@@ -273,7 +269,7 @@ class VideoReader:
         except VideoError:
             raise
         except (*av_errors(), ValueError, Damage) as error:
-            raise not_a_video(self.path, library_reason(error)) from error
+            raise not_a_video(self.path, one_line(error)) from error
         return VideoInfo(rate or Fraction(25), width, height, num_frames)
 
     def _read_container(self) -> Generator[Frame]:
@@ -306,7 +302,7 @@ class VideoReader:
         except VideoError:
             raise
         except (*av_errors(), ValueError, Damage) as error:
-            damage = library_reason(error)
+            damage = one_line(error)
         if self._stop is not None and num_read >= self._stop:
             return
         if damage:
@@ -331,14 +327,16 @@ class VideoReader:
     # Images.
 
     def _find_images(self) -> list[Path] | None:
-        try:
+        with refusing(VideoError, f"{str(self.path)!r}: cannot be read"):
             if self.path.is_dir():
                 entries = [each for each in self.path.iterdir() if not each.name.startswith(".")]
                 # A folder or a broken link of such a name is an image missing: reading it says so,
                 # where leaving it out would shift all frames after it.
-                images = [each for each in entries if each.suffix.lower() in IMAGE_SUFFIXES]
-                films = [each for each in entries if each.suffix.lower() in VIDEO_SUFFIXES]
-                if unread := [each for each in entries if each.suffix.lower() in _UNREAD]:
+                images, films, unread = (
+                    [each for each in entries if each.suffix.lower() in suffixes]
+                    for suffixes in (IMAGE_SUFFIXES, VIDEO_SUFFIXES, _UNREAD)
+                )
+                if unread:
                     self.left_out = (
                         f"pictures of kinds that are not read are left out, {len(unread)}, such as "
                         f"{min(unread).name}: save them as PNG or JPEG"
@@ -357,12 +355,6 @@ class VideoReader:
                 raise VideoError("expected a file or a folder, found a device")
             if self.path.stat().st_size == 0:
                 raise VideoError("the file is empty; get a complete copy")
-        except VideoError:
-            raise
-        except (OSError, ValueError) as error:  # ValueError: a null character in the name
-            raise VideoError(
-                f"{str(self.path)!r}: cannot be read: {library_reason(error)}"
-            ) from error
         if self.path.suffix.lower() not in IMAGE_SUFFIXES:
             return None
         if (count := num_pictures(self.path)) > 1:
