@@ -27,6 +27,9 @@ from torch import Tensor
 from torchcss.inference.mixture import Prior
 from torchcss.types import CostFunction, Items, Numbers, Vectors
 
+_COSTS = ("cost", "coarse", "screening", "past", "motion")
+"""The parts that are costs."""
+
 
 class SearchProblem(NamedTuple):
     """The posterior of one frame, as a tracker sees it; see the module's table.
@@ -65,11 +68,6 @@ class SearchProblem(NamedTuple):
         """The problem of some of the samples."""
         if self.restrict is not None:
             return self.restrict(items)
-        relatives = {
-            name: None if cost is None else cost.take(items)
-            for name, cost in (
-                *(("coarse", self.coarse), ("screening", self.screening)),
-                *(("past", self.past), ("motion", self.motion)),
-            )
-        }
-        return self._replace(cost=self.cost.take(items), **relatives)
+        costs = {name: getattr(self, name) for name in _COSTS}
+        taken = {name: cost.take(items) for name, cost in costs.items() if cost is not None}
+        return self._replace(**taken)

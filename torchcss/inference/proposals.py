@@ -103,12 +103,6 @@ class Proposal(ABC):
         return self
 
 
-def unbounded(like: Vectors) -> Bounds:
-    """No limits on states like these."""
-    limit = torch.full_like(like.reshape(-1, like.shape[-1])[0], math.inf)
-    return Bounds(-limit, limit)
-
-
 def _capped(covariance: Matrices, max_deviation: Deviation | None) -> Matrices:
     """Shrink parameters whose standard deviation exceeds a limit; correlations stay."""
     if max_deviation is None:

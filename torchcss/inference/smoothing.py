@@ -230,7 +230,9 @@ def _energies(
     for step, deviation in enumerate(motion):
         own = None if spread is None else spread[step]
         before, wide = _carried(state[step], own, step, changes)
-        apart = _short_way(state[step + 1][None] - before[:, None], period)
+        apart = state[step + 1][None] - before[:, None]
+        if period is not None:
+            apart = apart - whole_periods(apart, period)
         if spread is not None and wide is not None:
             wide = wide[:, None] + spread[step + 1][None]
         edges.append(_gaussian_cost(apart, deviation, wide))
@@ -449,12 +451,15 @@ def _carried(
     return moved, None if spread is None else slope @ spread @ slope.mT
 
 
-def _short_way(apart: Tensor, period: Tensor | None) -> Tensor:
-    """Differences of periodic parameters, at most half a period long."""
-    if period is None:
-        return apart
+def whole_periods(apart: Float[Tensor, "*b n"], period: Vector) -> Float[Tensor, "*b n"]:
+    """What differences have to lose to be at most half a period long.
+
+    Args:
+        apart: The differences.
+        period: Period of each parameter, infinite for those that have none.
+    """
     finite = torch.where(period.isfinite(), period, 1.0).to(apart)
-    return apart - torch.where(period.isfinite(), finite * (apart / finite).round(), 0.0)
+    return torch.where(period.isfinite(), finite * (apart / finite).round(), 0.0)
 
 
 def _gaussian_cost(

@@ -309,7 +309,11 @@ class TrustRegionNewton:
         check_bounds(bounds, n)
         for name, vector in (("scale", scale), ("prior_variance", prior_variance)):
             if vector is not None:
-                _check_positive(name, vector, n)
+                _check_vector(name, vector, n)
+                if not bool((vector > 0).all()):
+                    raise ConfigurationError(
+                        f"{name}: expected positive numbers, got {vector.tolist()}"
+                    )
         starts = self.start(x0.reshape(batch.numel(), n))
         result = self.descend(cost, starts, bounds, scale=scale)
         modes = self.modes(result, bounds, prior_variance=prior_variance)
@@ -593,12 +597,6 @@ def _check_vector(name: str, vector: Tensor, n: int) -> None:
         raise ShapeError(
             f"{name}: expected one number per parameter, shape [{n}], got {list(vector.shape)}"
         )
-
-
-def _check_positive(name: str, vector: Tensor, n: int) -> None:
-    _check_vector(name, vector, n)
-    if not bool((vector > 0).all()):
-        raise ConfigurationError(f"{name}: expected positive numbers, got {vector.tolist()}")
 
 
 def _next_radius(radius: Tensor, length: Tensor, ratio: Tensor, accepted: Tensor) -> Tensor:

@@ -44,6 +44,8 @@ from dataclasses import field, replace
 from types import MappingProxyType
 from typing import Literal
 
+import torch
+
 from torchcss.errors import ConfigurationError
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import (
@@ -54,7 +56,6 @@ from torchcss.inference.proposals import (
     HeavyTailed,
     Proposal,
     Spherical,
-    unbounded,
 )
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds, Curvature, frozen
@@ -164,7 +165,8 @@ class Preset:
         """
         if self.limits:
             return limits
-        return unbounded(limits.lower)
+        infinite = torch.full_like(limits.lower, math.inf)
+        return Bounds(-infinite, infinite)
 
 
 PARTS_OF_A_PERSON = 18

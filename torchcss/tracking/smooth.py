@@ -32,6 +32,7 @@ from torchcss.inference.smoothing import (
     Transition,
     mode_weights,
     refine,
+    whole_periods,
 )
 from torchcss.types import Trajectory, Vector, frozen
 
@@ -256,9 +257,8 @@ def _unwrapped(
     state: Trajectory, changes: dict[int, Callable[[Tensor], Tensor]], period: Vector
 ) -> Trajectory:
     """The same states with every angle within half a turn of the one before."""
-    turns = period.isfinite()
-    whole, out = torch.where(turns, period, 1.0), [state[0]]
+    out = [state[0]]
     for step, own in enumerate(state[1:]):
         before = changes[step](out[-1]) if step in changes else out[-1]
-        out.append(own + torch.where(turns, whole * ((before - own) / whole).round(), 0.0))
+        out.append(own + whole_periods(before - own, period))
     return torch.stack(out)
