@@ -8,7 +8,6 @@ same body, wherever its lengths and shape came from.
 from __future__ import annotations
 
 import copy
-import inspect
 from collections.abc import Mapping
 from typing import NamedTuple, TypeVar
 
@@ -75,8 +74,8 @@ def state_from_tensors(tensors: Mapping[str, Tensor], body: BodyModel) -> Sessio
     like = body.tie
     try:
         body = copy.deepcopy(body)
-        own = {name.removeprefix("body."): t for name, t in tensors.items() if name[:5] == "body."}
-        body.load_state_dict({n: value.to(like.device) for n, value in own.items()}, assign=True)
+        own = {name: value.to(like.device) for name, value in _under(tensors, "body").items()}
+        body.load_state_dict(own, assign=True)
         mixture = _get(GaussianMixture, tensors, "tracker.mixture", like)
         assert mixture is not None
         tracker = TrackerState(
@@ -128,9 +127,14 @@ def _put(tensors: dict[str, Tensor], at: str, record: NamedTuple | None) -> None
 
 def _get(kind: type[Record], tensors: Mapping[str, Tensor], at: str, like: Tensor) -> Record | None:
     """A record of tensors alone; None if none of them is there."""
-    names = inspect.signature(kind).parameters
-    found = {name: tensors[f"{at}.{name}"] for name in names if f"{at}.{name}" in tensors}
-    return kind(**{name: value.to(like.device) for name, value in found.items()}) if found else None
+    found = {name: value.to(like.device) for name, value in _under(tensors, at).items()}
+    return kind(**found) if found else None
+
+
+def _under(tensors: Mapping[str, Tensor], at: str) -> dict[str, Tensor]:
+    """The tensors of a record by the names in it."""
+    paths = (name.removeprefix(f"{at}.") for name in tensors if name.startswith(f"{at}."))
+    return {name: tensors[f"{at}.{name}"] for name in paths}
 
 
 def _window(tensors: Mapping[str, Tensor], index: int, number: int) -> Window | None:
@@ -139,11 +143,9 @@ def _window(tensors: Mapping[str, Tensor], index: int, number: int) -> Window | 
 
 
 def _monitor(tensors: Mapping[str, Tensor]) -> MonitorState:
-    at = "monitor.history."
-    history = {
-        name.removeprefix(at): tuple(costs.tolist())
-        for name, costs in tensors.items()
-        if name.startswith(at)
-    }
-    total, score = tensors["monitor.sums"].tolist()
-    return MonitorState(history, tuple(tensors["monitor.excess"].tolist()), total, score)
+    history = _under(tensors, "monitor.history")
+    return MonitorState(
+        {name: tuple(costs.tolist()) for name, costs in history.items()},
+        tuple(tensors["monitor.excess"].tolist()),
+        *tensors["monitor.sums"].tolist(),
+    )
