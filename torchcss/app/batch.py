@@ -527,10 +527,6 @@ class TakenOver(Exception):
     """Somebody else has the clip now."""
 
 
-class Deadly(TorchcssError):
-    """Whoever tracks a clip dies."""
-
-
 class _Watch:
     """A sink that tells how far a clip is, and ends the tracking when somebody took over."""
 
@@ -602,8 +598,7 @@ def _track_into(place: Path, job: Job, clip: Clip, watch: _Watch) -> None:
     watch.first = begin
     watch.total = VideoReader(row["video"], start=begin, stop=end).num_selected
     own = {name: row[name] for name in SETTING_COLUMNS if name in row}
-    options = {name: row[name] for name in OPTION_COLUMNS if name in row}
-    options |= {name: Path(row[name]) for name in ("masks", "init") if name in row}
+    options = {name: row[name] for name in (*OPTION_COLUMNS, "masks", "init") if name in row}
     track_video(
         row["video"],
         camera=row.get("camera"),
@@ -647,7 +642,7 @@ def _refuse_deadly(place: Path, claims: Claims, claim: WorkClaim) -> None:
         seen = claims.sight(claim.name, generation)
         if seen is None or seen.released or _frames_in(place.with_name(f"{generation}")) != done:
             return
-    raise Deadly(
+    raise TorchcssError(
         f"the process that tracked it died {MOST_DEATHS} times with {done} frames done (by a "
         "crash, or for want of memory); these are kept, --retry-failed tries again"
     )

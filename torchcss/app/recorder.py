@@ -126,11 +126,10 @@ class Recorder:
 
     def __post_init__(self) -> None:
         session = self.session
-        going_on = None if self.begun is None else self.begun.checkpoint
         self._wall, self._began = 0.0, time.perf_counter()
         self._totals = _Totals()
         self._state = session.checkpoint()
-        if self.begun is None or going_on is None:
+        if self.begun is None:
             body = session.state.body
             track = Track.empty(body.state_names, body.joint_names, body)._replace(
                 likelihood_power=float(session.plan.tracker.stated_power),
@@ -139,6 +138,8 @@ class Recorder:
                 settings=asdict(session.settings),
             )
         else:
+            going_on = self.begun.checkpoint
+            assert going_on is not None
             track, notes = self.begun.track.first(going_on.num_frames), going_on.notes
             self._wall, totals = notes["wall_s"], notes["totals"]
             self._totals = _Totals(**{**totals, "statuses": torch.tensor(totals["statuses"])})

@@ -169,9 +169,10 @@ def track_video(
             _check_for_detector(body)
         source, is_known = _camera_of(Path(video), camera, options, start)
         files = _files_of(Path(video), keypoints, options)
-        files = _with_keypoints(files, source, out, selection, options)
-        if keypoints is None and options.init is None and options.first is None:
-            selection = _from_somebody(out / _KEYPOINTS_NAME, selection, options.person)
+        if keypoints is None:
+            files = _with_keypoints(files, source, out, selection, options)
+            if options.init is None and options.first is None:
+                selection = _from_somebody(out / _KEYPOINTS_NAME, selection, options.person)
         views = _all_views(files, source, selection, options, body.joint_of_name)
         if selection.start != start:
             views[0] = views[0].noted(
@@ -269,9 +270,7 @@ def _with_keypoints(
     selection: FrameSelection,
     options: TrackOptions,
 ) -> ViewFiles:
-    """The files with keypoints, which are detected where none are given, and their masks."""
-    if files.keypoints is not None:
-        return files
+    """The files with keypoints that are detected, and their masks where none are given."""
     open_view(files, source, selection)
     keypoints = out / _KEYPOINTS_NAME
     _detect(files.video, keypoints, selection, options)

@@ -39,7 +39,7 @@ from torchcss.cli.smooth import Smooth
 from torchcss.cli.track import Track
 from torchcss.cli.undistort import Undistort
 from torchcss.cli.view import Plot, Report, View
-from torchcss.errors import OutputError, TorchcssError
+from torchcss.errors import TorchcssError
 from torchcss.files import one_line
 from torchcss.studies.demo import DEMO_SETTINGS, run_demo
 from torchcss.types import frozen
@@ -120,12 +120,8 @@ def main(arguments: list[str] | None = None) -> int:
         # Settings check themselves, so that reading them may fail as well.
         verb = tyro.cli(Verb, prog="torchcss", args=words, description=_DESCRIPTION)  # type: ignore[arg-type]
         left = verb.run()
-    except TorchcssError as error:
+    except (TorchcssError, OSError) as error:  # the latter of a disk that fills up in mid-write
         print(f"torchcss: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        # A disk that fills up or goes away in mid-write.
-        print(f"torchcss: {OutputError(str(error))}", file=sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:  # the latter is torch's
         if not isinstance(error, MemoryError) and "memory" not in str(error):
