@@ -502,8 +502,7 @@ class TrackingSession:
             if frame % plan.jumps_every == 0:
                 flips = Flips(search=search, body=state.body, camera=camera, num=_NUM_FLIPS)
                 moves.append((flips, _NUM_FLIPS))
-            # The first pose was fitted to the keypoints.
-            if frame > 0 and (missed := self._missed_keypoints(cost, search)) is not None:
+            if (missed := self._missed_keypoints(cost, search)) is not None:
                 moves.append((missed, _NUM_FLIPS))
         if plan.limb_jumps:
             limbs = LostLimbs(search=search, body=state.body, cost=cost, num=plan.limb_jumps)
@@ -524,10 +523,10 @@ class TrackingSession:
         return replace(tracker, proposal=with_moves(search, moves, num), dynamics=dynamics)
 
     def _missed_keypoints(self, cost: TrackingCost, search: Proposal) -> MissedKeypoints | None:
-        """The move to keypoints that the best mode misses."""
+        """The move to keypoints that the best mode misses; the first pose was fitted to them."""
         keypoints = cost.views[0].keypoints
         term = next((term for term in cost.choice.terms if isinstance(term, JointTerm)), None)
-        if keypoints is None or term is None:
+        if keypoints is None or term is None or int(self.state.tracker.frame) == 0:
             return None
         return MissedKeypoints(
             search=search,
