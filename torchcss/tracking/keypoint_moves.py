@@ -95,11 +95,9 @@ def poses_at_keypoints(
 
     limit = MISSED**2 * term.nu
     missed = squared(joints) > limit
-    if num < 1 or not bool(missed.any()):
+    if num < 1 or not bool(missed.any()) or not (segments := Segments(body)).limbs:
         return x.new_zeros(0, len(x))
-    segments, which = Segments(body), targets.joint[missed]
-    if not segments.limbs:
-        return x.new_zeros(0, len(x))
+    which = targets.joint[missed]
     sight = joints - camera.centre_world.to(joints)
     sight = sight / sight.norm(dim=-1, keepdim=True)
     sight = sight.index_copy(0, which, camera.rays(targets.position[missed]))

@@ -257,7 +257,7 @@ class TrackingSession:
         body: BodyModel,
         views: Views,
         frame_interval: float,
-        plan: Plan | None = None,
+        plan: Plan | None,
     ) -> None:
         views = [views] if isinstance(views, (Camera, CameraView)) else views
         if not views:
