@@ -1,7 +1,6 @@
 """A tracker watched while it runs: the sink that shows its frames in the rerun viewer.
 
-`LiveViewer` is one of the `sinks` of a `torchcss.app.recorder.Recorder`; `torchcss track --live`
-makes it.
+`LiveViewer` is a `torchcss.app.recorder.Sink`; `torchcss track --live` makes it.
 """
 
 from __future__ import annotations

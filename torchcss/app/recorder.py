@@ -53,7 +53,7 @@ CHECKPOINT_EVERY = 10.0
 
 
 class Picture:
-    """The picture of a tracked frame with its modes: drawn when asked for, once for all sinks.
+    """The picture of a tracked frame with its modes: drawn when asked for, and once.
 
     Attributes:
         camera: Camera of the full-size image.
@@ -103,7 +103,7 @@ class Recorder:
         size_deviation: What is not known of the body's size, see `Track`.
         notes: Lines for the user, also in the summary.
         extra: Further entries of the summary; a resumed run keeps those that it is not given.
-        sinks: What sees the frames besides; closed at the end of the run.
+        sink: What sees the frames besides; closed at the end of the run.
         on_first_frame: Writes what else belongs to the run, when its first frame is saved.
         checkpoint_every: Seconds of wall time between checkpoints.
         begun: The run to go on with, which has a checkpoint; None: a new one starts.
@@ -118,7 +118,7 @@ class Recorder:
     size_deviation: float = 0.0
     notes: Sequence[str] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
-    sinks: Sequence[Sink] = ()
+    sink: Sink | None = None
     on_first_frame: Callable[[], None] | None = None
     checkpoint_every: float = CHECKPOINT_EVERY
     begun: Run | None = None
@@ -161,8 +161,8 @@ class Recorder:
         self._began = saved = time.perf_counter()
         with ExitStack() as stack:
             stack.enter_context(ended_by_sigterm())
-            for sink in self.sinks:
-                stack.push(partial(_close, sink))
+            if self.sink is not None:
+                stack.push(partial(_close, self.sink))
             bar = tqdm(
                 frames, "tracking", total, initial=len(writer), unit="frame", dynamic_ncols=True
             )
@@ -213,16 +213,15 @@ class Recorder:
         }
 
     def _take(self, frame: Posterior) -> None:
-        """Add a frame, and show it to the sinks."""
+        """Add a frame, and show it to the sink."""
         if not len(self._writer):
             self._replace_last_run()
         self._writer.append(modes_of(frame, is_first=not len(self._writer)))
         # The session may be one frame ahead when an interruption comes; its state then is not.
         self._state = self.session.checkpoint()
         self._totals.add(frame)
-        picture = Picture(frame, self.recorded[0].camera)
-        for sink in self.sinks:
-            sink.add(frame, picture)
+        if self.sink is not None:
+            self.sink.add(frame, Picture(frame, self.recorded[0].camera))
 
     def _save(self, ended: str) -> None:
         """Write track, summary and checkpoint, in this order: the checkpoint is never ahead."""

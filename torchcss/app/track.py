@@ -220,7 +220,7 @@ def _begin(
         size_deviation=_size_deviation(settings, first, len(views)),
         notes=notes,
         extra=_description(views, first, selection, options.init),
-        sinks=() if options.live is None else (options.live,),
+        sink=options.live,
         on_first_frame=None if is_given else partial(write_fitted_body, body, first, eye),
         checkpoint_every=options.checkpoint_every,
         lock=lock,
@@ -440,7 +440,7 @@ def _go_on(
         session=session,
         recorded=run.cameras,
         frame_interval=interval,
-        sinks=() if options.live is None else (options.live,),
+        sink=options.live,
         extra=_files_seen(views),
         checkpoint_every=options.checkpoint_every,
         begun=run,
@@ -469,15 +469,18 @@ def _check_same(
 ) -> None:
     """Refuse to go on with other settings or frames than a run was begun with."""
     before = {**asdict(settings_from_plain(run.settings)), **known}
-    other = [
-        f"{name} {before[name]}, now {value}"
-        for name, value in {**asdict(settings), **asdict(selection)}.items()
-        if name not in ("overlay", "threads", "stop") and before[name] != value
-    ]
-    if other:
+    now = {**asdict(settings), **asdict(selection)}
+    told = {name: now[name] for name in now if name not in ("overlay", "threads", "stop")}
+    with naming(run.folder, ConfigurationError):
+        _refuse_others(before, told)
+
+
+def _refuse_others(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to go on with other choices than a run was begun with."""
+    if other := [f"{n} {before[n]}, now {value}" for n, value in now.items() if value != before[n]]:
         raise ConfigurationError(
-            f"{run.folder}: the run was begun with {'; '.join(other)}; give the same, or leave "
-            "--resume out to start anew"
+            f"the run was begun with {'; '.join(other)}; give the same, or leave --resume out to "
+            "start anew"
         )
 
 
@@ -512,17 +515,9 @@ _OF_VIEWS = ("layout", "normalised", "offset", "frame_rate", "person", "sigma")
 def _check_same_options(files: ViewFiles, given: ViewFiles) -> None:
     """Refuse to read the files of a run otherwise than it was begun with, where that is said."""
     usual = ViewFiles(video=given.video, keypoints=None)
-    names = [*_OF_VIEWS, *(name for name in ("keypoints", "masks") if getattr(files, name) is None)]
-    other = [
-        f"{name} {getattr(files, name)}, now {getattr(given, name)}"
-        for name in names
-        if getattr(given, name) not in (getattr(usual, name), getattr(files, name))
-    ]
-    if other:
-        raise ConfigurationError(
-            f"the run was begun with {'; '.join(other)}; give the same, or leave --resume out to "
-            "start anew"
-        )
+    before, now, default = asdict(files), asdict(given), asdict(usual)
+    names = [*_OF_VIEWS, *(name for name in ("keypoints", "masks") if before[name] is None)]
+    _refuse_others(before, {name: now[name] for name in names if now[name] != default[name]})
 
 
 def _check_first_pose(known: Mapping[str, str] | None, given: Path) -> None:
