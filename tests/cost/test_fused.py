@@ -253,9 +253,8 @@ def test_what_is_packed_goes_with_its_frame(generator: torch.Generator) -> None:
     assert engine._view(cost, cost.past[0], cost.views[0]) is packed
     for weight in range(40):
         engine.value(cost.with_weights({"contour": float(weight)}), x)
-    assert len(engine._views._of[cost.views[0]]) < 40
+    assert len(engine._packs._of[cost.views[0]]) < 40
     del cost
     gc.collect()
     assert frame() is None
-    assert not len(engine._views._of)
-    assert not len(engine._priors._of)
+    assert not len(engine._packs._of)

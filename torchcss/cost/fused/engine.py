@@ -64,8 +64,8 @@ _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
 
 _PRIORS = (Stabiliser, Anthropometric, TemporalPrior, MixturePrior)
 _KEPT = 24
-"""Packed terms and costs that are kept of a frame, as long as that lives: with other terms and
-weights; and so many packed tables of a body."""
+"""What is kept packed of a frame, with other terms and weights, or of a body, as long as these
+live."""
 
 
 class _Packs:
@@ -73,6 +73,10 @@ class _Packs:
 
     def __init__(self) -> None:
         self._of: WeakKeyDictionary[Any, OrderedDict[Any, tuple[Any, Any]]] = WeakKeyDictionary()
+
+    def made(self, owner: BodyTables, make: Callable[..., Any], *what: Any) -> Any:
+        """What a function makes of some objects, made now if it is not known of a body."""
+        return self.of(owner, (make, *what), partial(make, *what))
 
     def of(
         self, owner: FrameContext | BodyTables, what: tuple[object, ...], make: Callable[[], Any]
@@ -234,7 +238,7 @@ class FusedEngine:
     def __init__(self, dtype: Literal["float32", "float64"] = "float32", threads: int = 1) -> None:
         self._made_of = dtype, threads
         self.real: Any = np.float32 if dtype == "float32" else np.float64
-        self._views, self._priors, self._bodies = _Packs(), _Packs(), _Packs()
+        self._packs = _Packs()
         self._workspaces: dict[tuple[Any, ...], Workspaces] = {}
         self._threads = threads
         self._helpers: dict[int, ThreadPoolExecutor] = {}  # by process: a fork has no threads
@@ -245,16 +249,12 @@ class FusedEngine:
 
     def value(self, cost: TrackingCost, x: States) -> Costs:
         """Cost in nats; see `TrackingCost.value`."""
-        with cost.timed("fused"):
-            result, others = self._evaluate(cost, x, slopes=False)
-        value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
+        value, others = self._values(cost, x)
         return value if others is None else value + others.value(x)
 
     def held_value(self, cost: TrackingCost, x: States, found_at: States) -> Costs:
         """Cost in nats with what is found at other states; see `TrackingCost.held_value`."""
-        with cost.timed("fused"):
-            result, others = self._evaluate(cost, x, found_at, slopes=False)
-        value = torch.from_numpy(result.value).to(x).reshape(x.shape[:-1])
+        value, others = self._values(cost, x, found_at)
         return value if others is None else value + others.held_value(x, found_at)
 
     def local_model(self, cost: TrackingCost, x: States) -> LocalModel:
@@ -268,6 +268,14 @@ class FusedEngine:
         if others is None:
             return model
         return model.plus(others.local_model(x))
+
+    def _values(
+        self, cost: TrackingCost, x: States, *found_at: States
+    ) -> tuple[Costs, TrackingCost | None]:
+        """Values, and the cost of what is not in them; None: nothing."""
+        with cost.timed("fused"):
+            result, others = self._evaluate(cost, x, *found_at, slopes=False)
+        return torch.from_numpy(result.value).to(x).reshape(x.shape[:-1]), others
 
     def _evaluate(
         self, cost: TrackingCost, *states: Tensor, slopes: bool
@@ -339,7 +347,7 @@ class FusedEngine:
             add(0)
 
     def _prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
-        return self._priors.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
+        return self._packs.of(past, (cost.choice,), lambda: self._pack_prior(cost, past))
 
     def _pack_prior(self, cost: TrackingCost, past: FrameContext) -> _Found:
         priors, others, states, repulsion, limbs = [], set(), [], [], []
@@ -373,7 +381,7 @@ class FusedEngine:
             scratch = partial(pack.make_limb_scratch, tree, limbs, body.num_parameters)
             return limbs, Workspaces(scratch)
 
-        limbs, workspaces = self._bodies.of(past.tables, (pack.pack_limbs, density), make)
+        limbs, workspaces = self._packs.of(past.tables, (pack.pack_limbs, density), make)
         turned = limbs.fixed @ pack.array(camera.R_camera_world).T
         limbs = limbs._replace(scale=weight, fixed=turned)
         return [_Packed(add_pose_prior, None, 0, (tree, limbs), workspaces)]
@@ -383,25 +391,21 @@ class FusedEngine:
     ) -> _Packed:
         tree, parts, real = self._tree(past.body, past), self._parts(past), self.real
         pairs = past.tables.of(InterpenetrationPairs)
-        repulsion = self._bodies.of(
-            past.tables, (term, pairs), lambda: pack.pack_repulsion(term, pairs, real)
-        )
+        repulsion = self._packs.made(past.tables, pack.pack_repulsion, term, pairs, real)
         interior, chain = repulsion.nodes.shape[2], repulsion.chain.shape[1]
         repulsion = repulsion._replace(scale=real(weight * term.weight / interior))
-        curves = pack.pack_curves(None, len(parts.row), real)
+        curves = pack.pack_curves(None, parts, real)
         records = tree, parts, repulsion, _is_exact(cost)
         memory = self._memory(pack.make_pair_scratch, tree, curves, interior, chain, 5, 0)
         return _Packed(add_repulsion, None, 0, records, memory)
 
     def _tree(self, body: BodyModel, context: FrameContext) -> Tree:
         """A body before the camera of a frame, packed once."""
-        make = partial(pack.pack_tree, body, context.camera)
-        return self._bodies.of(context.tables, (pack.pack_tree, body, context.camera), make)
+        return self._packs.made(context.tables, pack.pack_tree, body, context.camera)
 
     def _parts(self, past: FrameContext) -> Parts:
         """The parts of a body, packed once: their shape does not change."""
-        make = partial(pack.pack_parts, past.body, self.real)
-        return self._bodies.of(past.tables, (pack.pack_parts,), make)
+        return self._packs.made(past.tables, pack.pack_parts, past.tables.body, self.real)
 
     def _memory(
         self, make: Callable[..., Any], tree: Tree, curves: Curves, *sizes: int
@@ -413,7 +417,7 @@ class FusedEngine:
         return self._workspaces[key]
 
     def _view(self, cost: TrackingCost, past: FrameContext, context: FrameContext) -> _Found:
-        return self._views.of(
+        return self._packs.of(
             context, (cost.choice, past.body), lambda: self._pack_view(cost, past, context)
         )
 
@@ -427,35 +431,27 @@ class FusedEngine:
             record, kind = None, type(term)
             if kind in _IMAGES and isinstance(bound, OnPoints) and bound.camera is None:
                 make = partial(self._pack_image, term, bound, context)
-                record = self._views.of(context, (term, bound.image), make)
+                record = self._packs.of(context, (term, bound.image), make)
             if record is None:
                 others.add(term.name)
             else:
                 scale = cost.choice.weight(term.name) * bound.scale
-                name = _IMAGES[kind][0]
-                made[name] = record._replace(scale=self._precision(name)(scale))
+                made[_IMAGES[kind][0]] = record._replace(scale=type(record.scale)(scale))
         if not made:
             return [], frozenset(others)
         predictor = None
         if "edges" in made or "colours" in made:
             predictor = context.tables.of(ContourPredictor)
         tree, parts = self._tree(body, context), self._parts(past)
-        num, lens = len(parts.row), pack.pack_lens(camera)
-        records = {
-            **self._bodies.of(past.tables, (pack.absent,), lambda: self._absent(num)),
-            **made,
-        }
+        lens = pack.pack_lens(camera)
+        records = {**self._packs.made(past.tables, pack.absent, parts, real), **made}
         _repeat_for_all_modes(records, "flow", "keypoints")
         edges, colours = records["edges"], records["colours"]
         nothing = edges.scale * edges.back_facing + colours.scale * colours.back_facing
         view = View(
             lens=pack.in_precision(lens, real),
             precise=lens,
-            curves=self._bodies.of(
-                past.tables,
-                (pack.pack_curves, predictor),
-                lambda: pack.pack_curves(predictor, num, real),
-            ),
+            curves=self._packs.made(past.tables, pack.pack_curves, predictor, parts, real),
             nothing=float(nothing) * (0 if predictor is None else predictor.num_nodes),
             exact=_is_exact(cost),
             **records,
@@ -469,16 +465,8 @@ class FusedEngine:
 
     def _pack_image(self, term: Any, bound: OnPoints, context: FrameContext) -> Any:
         """The record of an image term, without its weight; None: its twin does not know it."""
-        name, make = _IMAGES[type(term)]
-        record = make(term, bound, context)
-        return None if record is None else pack.in_precision(record, self._precision(name))
-
-    def _absent(self, num_parts: int) -> dict[str, Any]:
-        records = pack.absent(num_parts).items()
-        return {name: pack.in_precision(record, self._precision(name)) for name, record in records}
-
-    def _precision(self, name: str) -> Any:
-        return np.float64 if name == "keypoints" else self.real
+        record = _IMAGES[type(term)][1](term, bound, context)
+        return None if record is None else pack.in_precision(record, self.real)
 
 
 def _by_sequence(cost: TrackingCost, states: Sequence[Array]) -> tuple[Array | None, list[int]]:

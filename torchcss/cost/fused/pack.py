@@ -173,10 +173,10 @@ def pack_lens(camera: Camera) -> Lens:
     )
 
 
-def pack_curves(predictor: ContourPredictor | None, num_parts: int, real: Real) -> Curves:
+def pack_curves(predictor: ContourPredictor | None, parts: Parts, real: Real) -> Curves:
     """The curves on which contours are found; none at all without a predictor."""
     if predictor is None:
-        return Curves(np.zeros((num_parts, 10, 0), real), 0, 0, 0, 0)
+        return Curves(np.zeros((len(parts.row), 10, 0), real), 0, 0, 0, 0)
     curves = [predictor.rings, predictor.meridians]
     flat = torch.cat([part.flatten(1, 2) for part in curves], dim=1).double()
     along = (flat[..., :3] * flat[..., 3:6]).sum(-1, keepdim=True)
@@ -193,11 +193,15 @@ def pack_potential(potential: RobustPotential) -> Potential | None:
     return Potential(kind, float(potential.nu), float(potential.sigma**2))
 
 
-def absent(num_parts: int) -> dict[str, Any]:
+def absent(parts: Parts, real: Real) -> dict[str, Any]:
     """Records of image terms that are not there, by their fields in `View`; their scale is zero."""
-    zeros, whole, kind = torch.zeros, np.zeros(num_parts, np.int64), np.int64(0)
+    num_parts, zeros, kind = len(parts.row), torch.zeros, np.int64(0)
+    whole = np.zeros(num_parts, np.int64)
     image, compared = {"field": zeros(2, 8, 8), "corner": torch.ones(2)}, Potential(kind, 1.0, 1.0)
-    return {
+    keypoints = _zero(PackedKeypoints)._replace(
+        row=whole[:0], place=np.zeros((0, 3)), target=zeros(1, 3, 0), potential=compared
+    )
+    records = {
         "edges": _zero(Edges)._replace(
             **image, steps=zeros(5), assignment=kind, strength=False, potential=compared
         ),
@@ -205,10 +209,9 @@ def absent(num_parts: int) -> dict[str, Any]:
         "flow": _zero(Flow)._replace(
             nodes=zeros(num_parts, 6, 0), target=zeros(1, 3, num_parts, 0), potential=compared
         ),
-        "keypoints": _zero(PackedKeypoints)._replace(
-            row=whole[:0], place=np.zeros((0, 3)), target=zeros(1, 3, 0), potential=compared
-        ),
+        "keypoints": in_precision(keypoints, np.float64),
     }
+    return {name: in_precision(record, real) for name, record in records.items()}
 
 
 def _zero(record: Any) -> Any:
@@ -285,14 +288,14 @@ def pack_flow(term: FlowTerm, bound: OnPoints, context: FrameContext) -> Flow | 
 def pack_keypoints(
     term: JointTerm, bound: OnPoints, context: FrameContext
 ) -> PackedKeypoints | None:
-    """The keypoints of a frame."""
+    """The keypoints of a frame, in double precision for all engines."""
     joint, position, precision = bound.image
     potential = pack_potential(term.potential)
     if potential is None:
         return None
     row, place = carried_markers(context.body, joint)
     target = torch.cat([position, precision[..., None]], dim=-1).mT
-    return PackedKeypoints(
+    record = PackedKeypoints(
         scale=bound.scale,
         row=row,
         place=place,
@@ -300,6 +303,7 @@ def pack_keypoints(
         far=(OUTLIER_LENGTHS * term.sigma) ** 2,
         potential=potential,
     )
+    return in_precision(record, np.float64)
 
 
 def pack_repulsion(term: Interpenetration, pairs: InterpenetrationPairs, real: Real) -> Repulsion:
