@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchcss.kernels import compiler
 from torchcss.vision.appearance import BINS, Appearance, colour_bins
 
 RED, GREEN, GREY = (0.9, 0.1, 0.1), (0.1, 0.8, 0.2), (0.5, 0.5, 0.5)
@@ -68,14 +67,17 @@ def test_old_colours_are_forgotten_by_degrees_and_too_few_pixels_teach_nothing()
     torch.testing.assert_close(same.outside, known.outside)
 
 
-def test_compiled_counts_are_those_of_their_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_mask_counts_its_own_pixels() -> None:
     image, _ = picture()
     masks = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0)) > 0.6
-    known = [Appearance.unknown(3, like=image).learn(image, masks, ~masks)]
-    monkeypatch.setattr(compiler, "COMPILED", False)
-    known.append(Appearance.unknown(3, like=image).learn(image, masks, ~masks))
-    for one, other in zip(*known, strict=True):
-        assert torch.equal(one, other)
+    known, bins = Appearance.unknown(3, like=image).learn(image, masks, ~masks), colour_bins(image)
+    for found, where in zip(known, (masks, ~masks), strict=True):
+        for row, mask in zip(found, where, strict=True):
+            share = torch.stack([(bins[mask] == one).double().mean() for one in bins.unique()])
+            torch.testing.assert_close(row[bins.unique()], share)
+            assert float(row.sum()) == pytest.approx(1)
+    empty = Appearance.unknown(0, like=image).learn(image, masks[:0], masks[:0])
+    assert empty.inside.shape == (0, BINS**3)
 
 
 def test_the_whole_range_of_colours_has_bins() -> None:

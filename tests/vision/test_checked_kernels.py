@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torchcss.kernels import compiler
 from torchcss.kernels.checked import run
-from torchcss.vision import appearance_kernels, blur_kernels, flow_kernels
+from torchcss.vision import blur_kernels, flow_kernels
 from torchcss.vision import rasterise_kernels, resample_kernels
 
 assert compiler.CHECKED
@@ -45,8 +45,6 @@ place, distance = 40 * rng.random((2, 30, 2)) - 10, rng.random((2, 30)) + 0.5
 near, seen = np.full((2, 17, 19), -1, single), np.full((2, 17, 19), -1)
 given = place, distance, distance > 0.6, np.arange(30).reshape(-1, 3), np.arange(10)
 run(rasterise_kernels.draw_triangles, *given, near, seen)
-counts = np.zeros((3, 5), int)
-run(appearance_kernels.count_bins, rng.integers(0, 5, (6, 7)), rng.random((3, 6, 7)) > 0.5, counts)
 print("checked")
 """
 

@@ -21,13 +21,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchcss.kernels.checked import run
 from torchcss.vision.background import Background
-from torchcss.vision.sampling import has_kernels
 
 Histograms = Float[Tensor, "layers bins"]
 
@@ -140,12 +139,10 @@ def _mix(old: Histograms, bins: Tensor, masks: Tensor, rate: float) -> Histogram
 
 def _counts(bins: Int[Tensor, "h w"], masks: Bool[Tensor, "layers h w"]) -> Tensor:
     """Pixels of each mask in each bin."""
-    if has_kernels(masks):
-        from torchcss.vision.appearance_kernels import count_bins
-
-        counts = torch.zeros(len(masks), BINS**3, dtype=torch.long)
-        run(count_bins, bins.contiguous(), masks.contiguous(), counts)
-        return counts
+    if masks.device.type == "cpu":
+        # Twenty times as fast as the sums over all pixels.
+        rows = [np.bincount(bins.numpy()[mask], minlength=BINS**3) for mask in masks.numpy()]
+        return torch.from_numpy(np.reshape(rows, (-1, BINS**3)))
     # `bincount` would have the host wait for the greatest bin.
     counts = torch.zeros(len(masks), BINS**3, dtype=torch.long, device=masks.device)
     return counts.scatter_add_(
