@@ -93,14 +93,11 @@ def rasterise(
             f"faces: expected vertex indices from 0 to {uv.shape[0] - 1}, got "
             f"{int(faces.min())} to {int(faces.max())}; does the mesh belong to these vertices?"
         )
-    if valid is not None:
-        check_shape("valid", valid, uv.shape[0])
+    valid = torch.ones_like(depth, dtype=torch.bool) if valid is None else valid
     uv, depth, faces = uv.detach(), depth.detach(), faces.long()
-    # float64, so that neither large coordinates nor thin triangles open cracks.
     place, distance = uv.double(), depth.double()
-    usable = _usable(place, distance)
-    usable = usable if valid is None else usable & valid
-    nearest = _nearest(place[None], distance[None], faces, usable[None], height, width).flatten()
+    nearest = nearest_faces(uv[None], depth[None], faces, height, width, valid=valid[None])
+    nearest = nearest.flatten()
     pixel = torch.nonzero(nearest >= 0)[:, 0]
     face = nearest[pixel]
 
@@ -162,38 +159,13 @@ def nearest_faces(
     check_shape("depth", depth, None, None)
     check_shape("uv", uv, *depth.shape, 2)
     check_shape("valid", valid, *depth.shape)
-    if label is not None:
-        check_shape("label", label, len(faces))
-    place, distance, faces = uv.detach().double(), depth.detach().double(), faces.long()
-    usable = _usable(place, distance) & valid
-    return _nearest(place, distance, faces, usable, height, width, label)
-
-
-def _usable(place: Float[Tensor, "*b 2"], distance: Float[Tensor, "*b"]) -> Bool[Tensor, "*b"]:
-    """Vertices that are before the camera, and not too far off."""
-    is_near = (place.abs() < _FARTHEST_PIXEL).all(-1)
-    return is_near & (distance > _NEAREST_DEPTH) & (distance < torch.inf)
-
-
-def _areas(place: Places, faces: Faces) -> Float[Tensor, " f"]:
-    """Signed areas of triangles, doubled."""
-    first, second, third = place[faces].unbind(1)
-    a, b = second - first, third - first
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _nearest(
-    place: Float[Tensor, "b v 2"],
-    distance: Float[Tensor, "b v"],
-    faces: Faces,
-    usable: Bool[Tensor, "b v"],
-    height: int,
-    width: int,
-    label: Int[Tensor, " f"] | None = None,
-) -> Int[Tensor, "b h w"]:
-    """Label of the nearest triangle for every pixel, -1 where there is none."""
-    pictures, vertices = distance.shape
     label = torch.arange(len(faces), device=faces.device) if label is None else label
+    check_shape("label", label, len(faces))
+    # float64, so that neither large coordinates nor thin triangles open cracks.
+    place, distance, faces = uv.detach().double(), depth.detach().double(), faces.long()
+    usable = valid & (place.abs() < _FARTHEST_PIXEL).all(-1)
+    usable = usable & (distance > _NEAREST_DEPTH) & (distance < torch.inf)
+    pictures, vertices = distance.shape
     if compiler.COMPILED and place.device.type == "cpu" and not torch.compiler.is_compiling():
         # Compiled: only where it is used.
         from torchcss.vision.rasterise_kernels import draw_triangles
@@ -213,6 +185,13 @@ def _nearest(
     nearest = _by_spans(place, distance, every, drawn, height, width, pictures)
     nearest = nearest.where(nearest < 0, label.repeat(pictures)[nearest])
     return nearest.view(pictures, height, width)
+
+
+def _areas(place: Places, faces: Faces) -> Float[Tensor, " f"]:
+    """Signed areas of triangles, doubled."""
+    first, second, third = place[faces].unbind(1)
+    a, b = second - first, third - first
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _by_spans(
