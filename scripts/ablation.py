@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from torchcss import Settings
 from torchcss.cli.options import SettingsOptions
 from torchcss.errors import ConfigurationError
 from torchcss.tracking.presets import PRESETS
+from torchcss.types import frozen
 
 DEFAULT = "the default"
 KEYPOINTS = (
@@ -60,7 +61,7 @@ ERRORS = ("PA", "best PA", "root", "best root")
 OTHERS = ("NLL", "lost", "s")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which clips, and which rows."""
 

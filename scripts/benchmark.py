@@ -35,7 +35,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -48,7 +48,7 @@ from torch import Tensor
 from torchcss.cost.total import TrackingCost
 from torchcss.io.pictures import read_image
 from torchcss.stopwatch import Stopwatch
-from torchcss.types import Curvature, LocalModel
+from torchcss.types import Curvature, LocalModel, frozen
 from torchcss.vision.features import FeatureExtractor
 from torchcss.vision.flow import TRACKING_FLOW
 
@@ -62,7 +62,7 @@ Way = tuple[Callable[[Tensor], Any], Tensor]
 AT_LEAST_S = 0.3  # A way that is faster is called again, and the mean time taken.
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Size of the problem and what to write."""
 

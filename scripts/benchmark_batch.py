@@ -21,7 +21,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -41,12 +41,12 @@ from torchcss.io.video import VideoReader
 from torchcss.studies.comparison import find_start
 from torchcss.studies.demo import CLIP, DEMO_SETTINGS
 from torchcss.studies.sequences import read_sequence
-from torchcss.types import Frame
+from torchcss.types import Frame, frozen
 
 SETTINGS = replace(DEMO_SETTINGS, overlay=False)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to track, and how often."""
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,12 +33,12 @@ from torchcss.studies.comparison import find_start, track_together
 from torchcss.studies.evaluation import Thresholds
 from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.settings import Settings
-from torchcss.types import Curvature, LocalModel
+from torchcss.types import Curvature, LocalModel, frozen
 
 SETTINGS = Settings()
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to track and how often to measure."""
 

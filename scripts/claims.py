@@ -40,6 +40,7 @@ from torchcss.studies.render.clutter import PILLAR_WIDTH
 from torchcss.studies.render.sequences import ARM_STYLE
 from torchcss.studies.render.sequences import CLUTTER as CLUTTER_STYLE
 from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.types import frozen
 
 ARM, CLUTTER, DARK = "arm", "body-clutter", "body-dark"
 ARM7 = "arm tracked as arm7"
@@ -60,7 +61,7 @@ AT_PILLAR = 0.02
 """How far beside the pillar is at it, as such a share: a limb's edge, not its middle, is caught."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """The reports to judge by."""
 

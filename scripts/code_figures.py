@@ -14,11 +14,12 @@ import ast
 import io
 import tokenize
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from common import REPOSITORY, Table, start, write_report
+
+from torchcss.types import frozen
 
 MOST_LINES = 50
 MOST_PARAMETERS = 8
@@ -30,7 +31,7 @@ _LAYOUT = (
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to measure."""
 

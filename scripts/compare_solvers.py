@@ -33,7 +33,6 @@ import importlib.util
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
@@ -56,6 +55,7 @@ from torchcss.kernels import compiler
 from torchcss.linalg import covariance_factor
 from torchcss.robust import Lorentzian, Quadratic
 from torchcss.studies.reprojection import ReprojectionProblem, reprojection_problem
+from torchcss.types import frozen
 
 OURS, EAGER = "torchcss", "torchcss, torch cost"
 TRF, LBFGS, JAX, COMPACTED = "scipy trf", "scipy L-BFGS-B", "jax", "jax compacted"
@@ -71,7 +71,7 @@ QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 CONVERGED = 1e-6  # Largest entry of the projected gradient over that of the start.
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """The problem, the starts, and how much work the solvers get."""
 

@@ -32,7 +32,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -45,6 +44,7 @@ from torchcss.files import prepare_output_folder
 from torchcss.kernels.pipeline import cache_folders
 from torchcss.show.style import save_figure
 from torchcss.studies.demo import CLIP
+from torchcss.types import frozen
 
 ENTRY = """
 import sys
@@ -69,7 +69,7 @@ print(util.find_spec("torchcss").origin, ", ".join(found), sep="\\n")
 """Tells which package is imported, and the versions beside it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What is compared."""
 

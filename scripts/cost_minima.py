@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,7 @@ from torchcss.studies.scenes import Scene, arm_scenes, sequence_scenes
 from torchcss.studies.sequences import read_sequence
 from torchcss.studies.slices import PROMINENCE, curve_minima
 from torchcss.tracking.settings import Settings, make_choice
+from torchcss.types import frozen
 
 COUNTED_TERMS = ("contour", "motion_boundaries", "flow", "stabiliser")
 POTENTIALS = {  # with sigma in pixels and the colour of its lines
@@ -56,7 +57,7 @@ PERCENTS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)  # ticks of the figure
 FIRST, DRAWN, MISLEADING = ("quadratic", 0.0), "r_shoulder_swing", 0.1
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which frames, and how their slices are sampled."""
 

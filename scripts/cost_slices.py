@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ from torchcss.studies.scenes import Scene, arm_scenes, sequence_scenes
 from torchcss.studies.sequences import read_sequence
 from torchcss.studies.slices import PROMINENCE, Slice, StateLine, sample_slice
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 # Of a body the lines that are looked at; of an arm all of them are.
 ON_BODY = (
@@ -52,7 +53,7 @@ LEAST_CERTAIN = ("eigen 0", "eigen 1", "eigen 2")
 NEAR = 0.35  # radians or metres to either side of a limit
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which frames, and how their slices are sampled."""
 

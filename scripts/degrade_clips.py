@@ -37,13 +37,14 @@ from torchcss.io.cameras import read_camera
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.joint_names import canonical_joint_name
 from torchcss.studies.sequence_writer import write_camera
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 SHORT_SIDE, OUTLIERS, SWAPPED = 160, 0.15, 5
 NOISE, BRIGHTNESS, COMPRESSED = 8.0, 0.4, 35
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to copy."""
 

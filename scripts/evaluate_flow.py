@@ -17,7 +17,6 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,11 +30,12 @@ from torch.nn import functional
 from torchcss.errors import FlowFileError
 from torchcss.io.pictures import read_image
 from torchcss.robust import Quadratic
+from torchcss.types import frozen
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.flow import ACCURATE, TRACKING_FLOW, OpticalFlow, robust_flow
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to score."""
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,7 +41,7 @@ from torchcss.robust import Quadratic
 from torchcss.studies.metrics import pa_mpjpe_mm, root_aligned_mpjpe_mm
 from torchcss.studies.random_person import RandomPerson, person_coverage, random_person
 from torchcss.studies.sequences import read_reference
-from torchcss.types import Keypoints, Vector
+from torchcss.types import Keypoints, Vector, frozen
 from torchcss.vision.camera import Camera
 
 BONES = {"thigh": ("hip", "knee"), "shank": ("knee", "ankle"), "upper_arm": ("shoulder", "elbow"),
@@ -68,7 +68,7 @@ HEADS = ("best", "of 7", "of 50", "r-a best", "r-a of 7", "ratios %", "viol. %",
          "joints %", "s")  # fmt: skip
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What is fitted."""
 

@@ -13,7 +13,6 @@ twelve joints and the frames in which somebody was found. With `--runs`, the run
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +26,12 @@ from torchcss.io.keypoints.arrays import read_points
 from torchcss.joint_names import LIMB_JOINTS
 from torchcss.studies.metrics import pa_mpjpe_mm, root_aligned_mpjpe_mm
 from torchcss.studies.sequences import read_reference
+from torchcss.types import frozen
 
 HEADS = ("clip", "frames", "found", "PA", "root", "css PA", "of 7", "css root", "of 7")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which clips."""
 

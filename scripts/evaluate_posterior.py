@@ -31,7 +31,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,6 +51,7 @@ from torchcss.linalg import squared_mahalanobis
 from torchcss.studies.evaluation import evaluate
 from torchcss.studies.sequences import read_reference
 from torchcss.tracking.smooth import Smoothing
+from torchcss.types import frozen
 
 FILES = ("video.mp4", "cameras.json", "keypoints2d.npz", "reference3d.npz")
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
@@ -61,7 +62,7 @@ HEADS = ("clip", "PA", "best PA", "root", "best root", "smooth PA", "smooth root
 TRACKING = Settings(overlay=False)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which clips, tracked how."""
 

@@ -13,7 +13,6 @@ first joint), "of all" that of the nearest fit.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from torchcss.io.video import read_frame
 from torchcss.studies.evaluation import silhouette
 from torchcss.studies.metrics import mask_overlap, root_aligned_mpjpe_mm
 from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.types import frozen
 
 COMPARED = {
     "joints": {"contours": False, "colours": False},
@@ -42,7 +42,7 @@ COMPARED = {
 FEW = StartSearch(num_starts=8, num_trunks=2, num_flips=8, num_samples=2)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What is fitted."""
 

@@ -11,7 +11,6 @@ are in one place it makes no difference which is which.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,14 @@ from torchcss.io.keypoints.one_person import size_of
 from torchcss.io.keypoints.sides import with_sides_put_back
 from torchcss.io.motion.positions import resample_motion
 from torchcss.joint_names import skeleton_joint_names
+from torchcss.types import frozen
 
 LEGS = ("hip", "knee", "ankle")
 FAR = 0.06
 HEADS = ("frames a second", "right frames", "of these exchanged", "exchanged frames", "put back, %")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which motions, seen how."""
 

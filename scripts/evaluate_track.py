@@ -11,7 +11,7 @@ is a peer: the last row of the table, in the frames that it saw the person.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +25,7 @@ from torchcss.io.run import Run
 from torchcss.joint_names import LIMB_JOINTS
 from torchcss.studies.evaluation import Evaluation, evaluate
 from torchcss.studies.metrics import LOST_MM
+from torchcss.types import frozen
 
 FRAMES_NOTE = (
     "MPJPE means something only if track and reference share one world frame; root-aligned MPJPE, "
@@ -38,7 +39,7 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which track, which reference, what to compare."""
 

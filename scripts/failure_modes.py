@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,7 @@ from torchcss.studies.plots import error_curves, failure_figure
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.presets import PRESETS, preset_name
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 COLUMNS = {
     # title: entry, factor
@@ -65,7 +66,7 @@ STEP_S = 0.5
 """Over how long weights are averaged, seconds."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What is tracked, by whom, and how long."""
 

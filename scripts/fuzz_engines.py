@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +48,7 @@ from torchcss.cost.total import TrackingCost, beside
 from torchcss.cost.visibility import ContourPredictor, contour_nodes, places
 from torchcss.inference.mixture import GaussianMixture, Prior
 from torchcss.robust import Leclerc, Lorentzian
-from torchcss.types import Curvature, Keypoints
+from torchcss.types import Curvature, Keypoints, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FrameFeatures
 from torchcss.vision.spline import spline_field
@@ -60,7 +60,7 @@ RELATIVE = {"float64": 1e-9, "float32": 1e-4}
 NEAR_END_PX = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to try."""
 

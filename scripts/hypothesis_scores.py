@@ -35,7 +35,7 @@ from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.comparison import find_start, plan_of
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Settings
-from torchcss.types import CostFunction, LocalModel
+from torchcss.types import CostFunction, LocalModel, frozen
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm"
 """What the table shows of each tracker."""
@@ -43,7 +43,7 @@ TRACKING = Settings(preset="rr_multiple_hypothesis", overlay=False)
 """How this script tracks, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config(Comparison):
     """What is tracked, and how long."""
 

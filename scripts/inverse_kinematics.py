@@ -48,7 +48,7 @@ from torchcss.solve.inverse_kinematics import (
     link_pose,
 )
 from torchcss.solve.self_motion import Curve, distance_from
-from torchcss.types import Bounds
+from torchcss.types import Bounds, frozen
 
 CASES: dict[str, tuple[str, str, str | None]] = {
     "ur5": ("ur5.urdf", "tool0", None),
@@ -63,7 +63,7 @@ SAME = 1e-3
 """Radians within which two isolated solutions are one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which arms and poses, and how much work the checks get."""
 

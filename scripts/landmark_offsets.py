@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +34,7 @@ from evaluate_posterior import find_clips
 from torchcss import read_camera, read_keypoints
 from torchcss.body.catalog import without_side
 from torchcss.studies.sequences import read_reference
+from torchcss.types import frozen
 
 HEADS = ("joint", "keypoints", "left", "up", "forwards", "spread", "before", "after")
 
@@ -48,7 +48,7 @@ _FEWEST = 20
 """Keypoints of a joint that tell a clip's own offset."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which clips."""
 

@@ -18,7 +18,7 @@ limits, to which the same mixtures are fitted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from torchcss.cost.pose_prior import (
 from torchcss.cost.stabiliser import Stabiliser
 from torchcss.errors import ConfigurationError
 from torchcss.io.motion.positions import limb_positions, read_motion_capture
+from torchcss.types import frozen
 
 Poses = dict[str, Float[Tensor, "t d"]]
 """Directions by group."""
@@ -50,7 +51,7 @@ _UP = (0.0, 1.0, 0.0)
 LEVELS = [0.1 * tenth for tenth in range(1, 10)]
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What is learnt from, and what."""
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ from torchcss.tracking.settings import (
     make_choice,
     make_extractor,
 )
-from torchcss.types import Frame
+from torchcss.types import Frame, frozen
 from torchcss.vision.features import FrameFeatures
 
 OPTIMISER = TrustRegionNewton(max_steps=30, tolerance=1e-6)
@@ -61,7 +61,7 @@ TRACKING = Settings(body="arm8", keypoints_use="first", working_size=320)
 """How this script tracks, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to learn from, and how long."""
 

@@ -32,13 +32,13 @@ from torchcss.io.tracks import TRACK_NAME
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.studies.demo import CLIP, DEMO_SETTINGS
 from torchcss.tracking.session import Posterior
-from torchcss.types import Frame
+from torchcss.types import Frame, frozen
 
 TRACKING = replace(DEMO_SETTINGS, overlay=False)
 """How this script tracks, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """How long the films are."""
 

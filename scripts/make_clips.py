@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,11 +48,12 @@ from torchcss.studies.render.sequences import (
     shot_of_motion,
 )
 from torchcss.studies.sequence_writer import write_sequence
+from torchcss.types import frozen
 
 PATTERNS = ("plaid", "stripes", "plain")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which clips."""
 

@@ -8,7 +8,6 @@ same clip, up to what the video encoder does.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -16,9 +15,10 @@ from common import start
 
 from torchcss.studies.demo import CLIP, write_clip
 from torchcss.studies.render.sequences import arm_sequence
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to film."""
 

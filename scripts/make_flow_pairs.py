@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,7 @@ from jaxtyping import Bool, Float
 from PIL import Image
 
 from torchcss.files import prepare_output_folder
+from torchcss.types import frozen
 
 Places = Float[np.ndarray, "h w 2"]
 
@@ -46,7 +46,7 @@ TEXTURES = {"fine": (4.0, 60.0, 0.5), "natural": (4.0, 200.0, 1.0), "smooth": (3
 WAVES, CONTRAST, LITTLE, NOISE, BRIGHTER = 150, 45.0, 0.15, 3.0, (1.08, 12.0)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to make."""
 

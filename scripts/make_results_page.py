@@ -12,7 +12,6 @@ cells, or an object of `cells` with a `command`, `version` or `date` of its own.
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from common import REPOSITORY, cell_text, start
 
 from torchcss.errors import TrackFileError
 from torchcss.files import load_json, replace_file
+from torchcss.types import frozen
 
 HEAD = """# Results
 
@@ -34,7 +34,7 @@ LAST = 1000
 """Place of a table that names none."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Where the reports are and where the page goes."""
 

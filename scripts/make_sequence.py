@@ -11,7 +11,6 @@ A motion file holds `body` (a name), `state_names [n]`, `states [T n]` and `fram
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,9 +21,10 @@ from torchcss.errors import ConfigurationError
 from torchcss.studies.render.sequences import STYLES, Shot, shot, shot_of_motion
 from torchcss.studies.sequence_writer import write_sequence
 from torchcss.studies.sequences import read_motion
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to render."""
 

@@ -16,7 +16,7 @@ All of one seed start from the same first pose, except that arms of other length
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,7 @@ from torchcss.body.shape import SHAPE_NAMES, with_shape
 from torchcss.studies.comparison import Start, find_start, plan_of
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Plan, Settings
-from torchcss.types import Bounds
+from torchcss.types import Bounds, frozen
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm", "pa_mpjpe_mm"
 """What the table shows of each tracker."""
@@ -42,7 +42,7 @@ VARIATIONS = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config(Comparison):
     """What is tracked, and how long."""
 

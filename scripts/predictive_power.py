@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,6 +52,7 @@ from torchcss.errors import ConfigurationError
 from torchcss.files import prepare_output_folder, save_arrays
 from torchcss.io.keypoints.read import read_keypoints
 from torchcss.joint_names import canonical_joint_name
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 PREDICTED = ("l_elbow", "l_wrist", "r_knee", "r_ankle")
@@ -66,7 +67,7 @@ POWERS = (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0)
 TRACKING = Settings(overlay=False)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which clips, tracked how."""
 

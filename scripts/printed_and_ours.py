@@ -12,7 +12,7 @@ keypoints in the first frame alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,6 +23,7 @@ from torchcss.inference.tracker import Tracker
 from torchcss.studies.comparison import Start, find_start, plan_of
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Plan, Settings
+from torchcss.types import frozen
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm", "pa_mpjpe_mm"
 """What the table shows of each tracker."""
@@ -30,7 +31,7 @@ ENDS = {"ours": ("css", "ijrr_css"), "printed": ("ijrr_css", "css")}
 """The two ends, and what each of them takes parts from."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config(Comparison):
     """What is tracked, and how long; the presets are those of the two ends."""
 

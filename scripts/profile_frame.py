@@ -37,6 +37,7 @@ from torchcss.kernels import checked
 from torchcss.tracking.flip_moves import Flips
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 from torchcss.vision import features
 
 STAGES: dict[str, tuple[Any, str]] = {
@@ -109,7 +110,7 @@ PERIOD = 3
 """Flips of limbs are searched in every third frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to track."""
 

@@ -40,7 +40,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -75,6 +74,7 @@ from torchcss.inference import trust_region
 from torchcss.kernels import checked
 from torchcss.show.style import save_figure
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 REST, ALL = "the rest", "all"
@@ -111,7 +111,7 @@ Seconds = dict[str, dict[str, float]]
 """Times by way and stage."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What to measure and what to write."""
 

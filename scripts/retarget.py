@@ -22,7 +22,6 @@ up, the middle of the path over the origin, floor at height 0) holds
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -39,9 +38,10 @@ from torchcss.show.style import save_figure
 from torchcss.solve.retarget import Retargeted, retarget
 from torchcss.studies.render.motions import Motion
 from torchcss.studies.sequence_writer import write_motion
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which motion, onto which body."""
 

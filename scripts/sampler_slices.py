@@ -35,13 +35,13 @@ from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.linalg import squared_mahalanobis
 from torchcss.show.style import save_figure
 from torchcss.studies.sampling_study import StudyChoice, study_problem
-from torchcss.types import Bounds, CostFunction, LocalModel, Status
+from torchcss.types import Bounds, CostFunction, LocalModel, Status, frozen
 
 CHOICE = StudyChoice(pixel_noise=2.0, prior_scale=3.0)
 """Priors that reach as far as the flip, and noise that leaves the valley there narrow."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """The slice and the samplers."""
 

@@ -58,7 +58,7 @@ from torchcss.studies.metrics import (
 )
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import Settings
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, frozen
 from torchcss.vision.camera import Camera
 
 BEAM, BOARD = "balance_beam_4cam", "handheld_board"
@@ -70,7 +70,7 @@ TRACKING = Settings()
 """How this script tracks, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Which recordings, and how long."""
 

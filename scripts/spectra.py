@@ -19,7 +19,6 @@ parameters, at a start mode of each of `--poses` seeds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -37,13 +36,14 @@ from torchcss.linalg import constrained_inverse
 from torchcss.studies.comparison import find_start, session_of
 from torchcss.studies.sampling_study import spectrum, study_problem
 from torchcss.studies.sequences import RecordedSequence, read_sequence
+from torchcss.types import frozen
 
 TRACKING = Settings(preset="ijrr_css", overlay=False)
 BODIES = ("arm8", "body32")
 """Of Fig. 5."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config(Comparison):
     """What is tracked, and how long."""
 

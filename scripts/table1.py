@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,7 +47,7 @@ from torchcss.studies.sampling_study import (
     spectrum,
     study_problem,
 )
-from torchcss.types import Modes
+from torchcss.types import Modes, frozen
 
 COLUMNS = {
     "minima": "minima",
@@ -83,7 +83,7 @@ LABELS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """The problem, the search and the counting."""
 

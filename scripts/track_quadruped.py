@@ -13,7 +13,7 @@ exact truth, and of the base's place, in millimetres.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,7 +33,7 @@ from torchcss.studies.render.robots import film_robot, stand, trot
 from torchcss.studies.render.scene import look_at
 from torchcss.tracking.session import TrackingSession
 from torchcss.tracking.settings import TERMS, Settings
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, frozen
 
 MARKED = ("THIGH", "SHANK", "FOOT")
 """Links whose origins are marked: hip, knee and foot of every leg."""
@@ -54,7 +54,7 @@ TRACKING = Settings(
 """How this script tracks, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """Who trots, and what is seen."""
 

@@ -19,7 +19,7 @@ optical flow alone, if at all. The table tells the joints apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from torchcss.solve.inverse_kinematics import link_pose, pose_errors
 from torchcss.studies.demo import track_sequence
 from torchcss.studies.render.robots import robot_arm, robot_sequence
 from torchcss.tracking.settings import TERMS, Settings
+from torchcss.types import frozen
 
 ROBOTS: dict[str, tuple[str, tuple[float, ...]]] = {
     "panda": ("panda_hand", (0.0, -0.3, 0.0, -1.9, 0.0, 1.9, 0.8, 0.02)),
@@ -54,7 +55,7 @@ TRACKING = Settings(
 """How this script tracks, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """What moves, how long, and how it is tracked."""
 

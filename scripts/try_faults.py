@@ -48,6 +48,7 @@ from torchcss.app.batch import MOST_DEATHS, Batch
 from torchcss.io.tracks import load_track
 from torchcss.studies.demo import CLIP
 from torchcss.tracking.settings import Settings
+from torchcss.types import frozen
 
 SETTINGS = Settings(body="arm8", samples=8, modes=2, keypoints_use="first", overlay=False)
 _WORDS = (
@@ -61,7 +62,7 @@ _SMALL = 12_000
 """Bytes of a file that is smaller than a track of some frames."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Config:
     """How much is tried."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from torchcss.studies.comparison import Start, track_together
 from torchcss.studies.evaluation import Thresholds, over_seeds, summarise
 from torchcss.studies.sequences import RecordedSequence, read_sequence
 from torchcss.tracking.settings import Plan, Settings
+from torchcss.types import frozen
 
 Entrants = Mapping[str, tuple[Settings, Start, Plan]]
 """What is run: settings, first pose and plan by name."""
@@ -21,7 +22,7 @@ TRACKING = Settings(keypoints_use="first", overlay=False)
 """How comparisons track, where nothing else is said."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Comparison:
     """What is tracked, and how long."""
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from torchcss.io.fitted_body import FITTED_BODY_NAME, read_fitted_body
 from torchcss.io.keypoints.read import Scale
 from torchcss.io.tracks import SUMMARY_NAME, TRACK_NAME, Track, load_track, read_summary
 from torchcss.io.view_files import RecordedCamera, ViewFiles
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 TOLERANCE = 1e-4
@@ -38,7 +39,7 @@ TOLERANCE = 1e-4
 rounding."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Given:
     """What a run lacks, or has moved; what is given here counts before what the folder says.
 
@@ -59,7 +60,7 @@ class Given:
         make_paths(self)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class GivenKeypoints:
     """The same of what belongs to the first camera's video.
 
@@ -80,7 +81,7 @@ class GivenKeypoints:
         make_paths(self)
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class Run:
     """A finished, or interrupted, run.
 

@@ -10,7 +10,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,12 +18,13 @@ from torchcss.errors import ConfigurationError
 from torchcss.files import make_paths
 from torchcss.io.cameras import camera_entry
 from torchcss.io.keypoints.read import Scale
+from torchcss.types import frozen
 from torchcss.vision.camera import Camera
 
 PATHS = ("video", "keypoints", "masks")
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ViewFiles:
     """What one camera recorded.
 

@@ -26,7 +26,6 @@ By default: `edge_features(grey)`; `FeatureExtractor` calls it for every frame.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -35,6 +34,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.errors import ShapeError, check_positive
+from torchcss.types import frozen
 from torchcss.vision.sampling import gaussian_blur
 
 Image = Float[Tensor, "h w"]
@@ -43,7 +43,7 @@ _ROUNDING = 1.0e-4
 """Gradients of the normalised image below this are rounding; a flat image has energy zero."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class EdgeConfiguration:
     """Choices of the edge detector; the papers give none of these numbers.
 

@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +53,7 @@ from torch.nn import functional
 from torchcss.errors import ConfigurationError, FrameError, ShapeError
 from torchcss.kernels.checked import run
 from torchcss.robust import Charbonnier, Leclerc, Lorentzian, Quadratic
+from torchcss.types import frozen
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.warping import (
     Coefficients,
@@ -111,7 +112,7 @@ _WINDOWS_AT_ONCE = 16384
 """Windows of the weighted median per pass; bounds its memory."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class FlowConfiguration:
     """Choices of the flow.
 

@@ -20,7 +20,7 @@ Each format is a module of its own that makes the content; only this one touches
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -35,6 +35,7 @@ from torchcss.io.export.tables import angles_text, csv_text, joint_covariances, 
 from torchcss.io.export.trc import trc_text
 from torchcss.io.run import Run, as_run, body_of_track
 from torchcss.io.tracks import Track
+from torchcss.types import frozen
 
 Format = Literal["bvh", "trc", "c3d", "mot", "angles", "csv", "npz", "npz-smpl"]
 FORMATS: tuple[str, ...] = get_args(Format)
@@ -45,7 +46,7 @@ _UP: dict[str, FrameOfFile] = {**dict.fromkeys(("bvh", "trc", "mot"), "y-up"), "
 """What the readers of a format take for up."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class ExportOptions:
     """What goes into a file, and how.
 

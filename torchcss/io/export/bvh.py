@@ -13,7 +13,6 @@ Call `bvh_text`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -24,9 +23,10 @@ from torchcss.body.rotations import ROTATION_ORDERS, euler_angles
 from torchcss.errors import ConfigurationError
 from torchcss.io.export.selection import Selection
 from torchcss.io.export.skeleton import Skeleton, make_skeleton, node_poses, t_pose
+from torchcss.types import frozen
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class BvhStyle:
     """How a BVH is written.
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from torchcss.body.uncertainty import Held
 from torchcss.errors import ConfigurationError, VideoError
 from torchcss.io.tracks import Track
 from torchcss.io.video import VideoReader, usual_step
-from torchcss.types import TIME_ROUNDING, as_array
+from torchcss.types import TIME_ROUNDING, as_array, frozen
 from torchcss.vision.camera import Camera
 
 DEFAULT_FRAME_RATE = 25.0
@@ -97,7 +96,7 @@ class Selection(NamedTuple):
         return self.rank >= 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@frozen
 class SelectionChoice:
     """Which modes and frames go into a file, and what is up.
 
