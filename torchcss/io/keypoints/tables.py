@@ -92,7 +92,6 @@ class _Columns(NamedTuple):
 
     Attributes:
         parts: Column of each of u, v and confidence, by person and joint.
-        size: How many columns there are.
         frame: The column that numbers the frames; None: a frame is a row.
         joint: The column that names the joint, if the heading does not.
         track: The column that says who it is.
@@ -100,7 +99,6 @@ class _Columns(NamedTuple):
     """
 
     parts: Mapping[tuple[str, str], Mapping[int, int]]
-    size: int
     frame: int | None
     joint: int | None = None
     track: int | None = None
@@ -125,24 +123,25 @@ def people_of_rows(rows: list[Row]) -> People:
     if VIA_SHAPE in heading:
         return read_via_table(heading, rows[1:])
     columns, report = _headed(heading), []
-    rows = rows if columns.joint is None else _of_the_body(rows, columns.joint, report)
+    body = _even(rows[1:], len(heading))
+    body = body if columns.joint is None else _of_the_body(body, columns.joint, report)
     video = words.first_of({cell: n for n, cell in enumerate(heading)}, words.VIDEOS)
     if video is not None:
-        check_one_video({"".join(row[video : video + 1]) for _, row in rows[1:]} - {""})
+        check_one_video({row[video] for _, row in body} - {""})
     if columns.time is not None and columns.frame is not None:
-        first = rows[1][1][columns.frame : columns.frame + 1]
-        if first and words.seconds_in(first[0]) is not None:
+        first = body[0][1][columns.frame]
+        if words.seconds_in(first) is not None:
             columns = columns._replace(time="seconds")
-        elif first and ":" in first[0]:  # it counts frames in a second
+        elif ":" in first:  # it counts frames in a second
             columns = columns._replace(frame=None, time=None)
     said = [n for n in (columns.frame, columns.track) if n is not None]
-    who = {tuple("".join(row[n : n + 1]) for n in said) for _, row in rows[1:]}
-    if not said and columns.joint is None and _counts(rows):
+    who = {tuple(row[n] for n in said) for _, row in body}
+    if not said and columns.joint is None and _counts(heading[0], body):
         columns = columns._replace(frame=0)
-    elif len(who) == 1 < len(rows) - 1 and said and not "".join(*who)[:1].isdecimal():
+    elif len(who) == 1 < len(body) and said and not "".join(*who)[:1].isdecimal():
         columns = columns._replace(frame=None, time=None)  # the name of the video
     report += _told(columns, heading)
-    joints, frames = _read_rows(columns, rows[1:])
+    joints, frames = _read_rows(columns, body)
     if columns.time is not None:
         frames = in_seconds(columns.time, frames)
     frames, joints = _without_hands(frames, joints, report)
@@ -153,19 +152,34 @@ def people_of_rows(rows: list[Row]) -> People:
         return people._replace(layout=LAYOUT, corner_fractions=True)
     report.insert(0, "format: CSV, a heading per column")
     first = 0 if any(cell.lower() == "frame_idx" for cell in heading) else None  # SLEAP's
-    size = _said_size(heading, rows[1:])
+    size = _said_size(heading, body)
     return people._replace(first=first, by_hand=heading == [*_HAND], size_wh=size)
+
+
+def _even(rows: Sequence[Row], size: int) -> list[Row]:
+    """Rows of so many cells, without empty ones behind them.
+
+    Raises:
+        KeypointError: If one has fewer, or more.
+    """
+    even = [(n, cells if any(cells[size:]) else cells[:size]) for n, cells in rows]
+    for number, cells in even:
+        if len(cells) != size:
+            raise KeypointError(
+                f"row {number}: expected {size} columns, as the heading has, found {len(cells)}; "
+                "get a complete copy"
+            )
+    return even
 
 
 def _of_the_body(rows: list[Row], joint: int, report: list[str]) -> list[Row]:
     """Those of the body, where a column says of which of Holistic's parts a landmark is."""
-    body = rows[1:]
-    for column in {*range(min(len(row) for _, row in body))} - {joint}:
-        parts = [words.plain_word(row[column]) for _, row in body]
+    for column in {*range(len(rows[0][1]))} - {joint}:
+        parts = [words.plain_word(row[column]) for _, row in rows]
         others = sorted(part for part in {*parts} if not _BODY.match(part))
         if 0 < len(others) < len({*parts}) and all(map(_OF_BODY_PARTS.search, others)):
             report.append(f"rows left out: {', '.join(others)}")
-            return [rows[0], *(row for row, n in zip(body, parts, strict=True) if _BODY.match(n))]
+            return [row for row, part in zip(rows, parts, strict=True) if _BODY.match(part)]
     return rows
 
 
@@ -174,7 +188,7 @@ def _said_size(heading: Sequence[str], rows: Sequence[Row]) -> tuple[float, floa
     places = {cell: n for n, cell in enumerate(heading)}
     for pair in words.SIDES[:-1]:
         columns = [words.first_of(places, (side,)) for side in pair]
-        said = {tuple("".join(row[n : n + 1]) for n in columns if n is not None) for _, row in rows}
+        said = {tuple(row[n] for n in columns if n is not None) for _, row in rows}
         if None not in columns and len(said) == 1:
             with suppress(ValueError):
                 width, height = map(float, *said)
@@ -203,7 +217,7 @@ def _told(columns: _Columns, heading: Sequence[str]) -> list[str]:
     report = ["no confidence in the file: 1 for every joint that has a place other than (0, 0)"]
     if found:
         report = [f"confidence: columns such as {found[0]}"]
-    others = {*range(columns.size)} - used - {columns.frame, columns.joint, columns.track}
+    others = {*range(len(heading))} - used - {columns.frame, columns.joint, columns.track}
     if left := [heading[index] for index in sorted(others) if heading[index]]:
         report.append(f"columns left out: {shortened(', '.join(left))}")
     return report
@@ -348,10 +362,10 @@ def _with_one_heading(rows: list[Row]) -> list[Row]:
     return [(number, heading), *rest]
 
 
-def _counts(rows: Sequence[Row]) -> bool:
+def _counts(head: str, rows: Sequence[Row]) -> bool:
     """Whether the first column has no name and counts the rows, as pandas writes it."""
-    cells = [row[0] for _, row in rows[1:]]
-    if words.plain_word(rows[0][1][0]) not in ("", "unnamed0", "index") or not all(
+    cells = [row[0] for _, row in rows]
+    if words.plain_word(head) not in ("", "unnamed0", "index") or not all(
         re.fullmatch("[0-9]{1,9}", cell) for cell in cells
     ):
         return False
@@ -399,14 +413,14 @@ def _headed(heading: Sequence[str]) -> _Columns:
         columns = {joint: parts for joint, parts in columns.items() if joint not in numbered}
     if joint is not None and set(columns) == {("", "")}:
         track = None if track == joint else track
-        return _Columns({("", ""): columns["", ""]}, len(heading), frame, joint, track, time)
+        return _Columns({("", ""): columns["", ""]}, frame, joint, track, time)
     columns.pop(("", ""), None)
     if not columns:
         raise KeypointError(
             f"row 1: expected DeepLabCut's headings, or columns such as nose_x and nose_y, "
             f"found {shortened(', '.join(heading))}"
         )
-    return _Columns(columns, len(heading), frame, None, track, time)
+    return _Columns(columns, frame, None, track, time)
 
 
 def _split(cell: str, kinds: Mapping[str, int] = _PARTS) -> tuple[str, int, int] | None:
@@ -460,7 +474,7 @@ def _deeplabcut(rows: Sequence[Row]) -> tuple[_Columns, Sequence[Row], list[str]
     if not body:
         raise KeypointError("no frames below the headings; get a complete copy")
     # Of labelled frames the picture's name is the index; of a video's its number.
-    return _Columns(parts, size, start - 1 if start else None), body, report
+    return _Columns(parts, start - 1 if start else None), _even(body, size), report
 
 
 def _read_rows(columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frames]:
@@ -469,13 +483,6 @@ def _read_rows(columns: _Columns, body: Sequence[Row]) -> tuple[list[str], Frame
     found: dict[Key, dict[str, dict[str, list[float]]]] = {}
     for index, (row, cells) in enumerate(body):
         where = f"row {row}"
-        if not any(cells[columns.size :]):
-            cells = cells[: columns.size]
-        if len(cells) != columns.size:
-            raise KeypointError(
-                f"{where}: expected {columns.size} columns, as the heading has, found "
-                f"{len(cells)}; get a complete copy"
-            )
         place = _place(where, columns, cells, index)
         track = "" if columns.track is None else words.track_text(cells[columns.track]) or ""
         for (person, joint), parts in columns.parts.items():
