@@ -45,7 +45,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcss.body.bases import on_origin, pose_track
@@ -292,13 +291,13 @@ class TrackWriter:
         Raises:
             ShapeError: If a shape does not fit, or a number that must be finite is not.
         """
-        frame, weights = int(modes.frame), _array("log_weight", modes.log_weight, (None,))
-        (k,) = weights.shape
+        frame, k = int(modes.frame), torch.as_tensor(modes.log_weight).numel()
         shapes = _shapes(len(self._begun.state_names), len(self._begun.joint_names))
         per_mode = {
             name: _array(name, getattr(modes, name), (k, *shape)) for name, shape in shapes.items()
         }
-        cost, parents = per_mode["cost"], per_mode["parent"].astype(np.int64)
+        weights, cost = per_mode["log_weight"], per_mode["cost"]
+        parents = per_mode["parent"].astype(np.int64)
         base = _array("base_transform", modes.base_transform, (4, 4))
         if np.isnan(weights).any() or (weights == np.inf).any() or not (weights > -np.inf).any():
             raise ShapeError(
@@ -563,17 +562,12 @@ def _in_folder(path: StrPath, name: str) -> Path:
         return path
 
 
-def _array(name: str, value: Tensor | ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
+def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return a float64 copy of checked shape; only weights and costs may be infinite."""
-    source: Any = value
-    if isinstance(source, Tensor):
-        source = source.detach().cpu().numpy()
+    source = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
     array = np.array(source, dtype=np.float64)
-    if len(array.shape) != len(shape) or any(
-        want not in (None, have) for want, have in zip(shape, array.shape, strict=True)
-    ):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ShapeError(f"{name}: expected a shape [{wanted}], got {list(array.shape)}")
+    if array.shape != shape:
+        raise ShapeError(f"{name}: expected a shape {list(shape)}, got {list(array.shape)}")
     if name not in ("log_weight", "cost") and not np.isfinite(array).all():
         raise ShapeError(f"{name}: expected finite numbers, got some that are not")
     return array
@@ -581,9 +575,7 @@ def _array(name: str, value: Tensor | ArrayLike, shape: tuple[int | None, ...]) 
 
 def _plain(value: Any) -> Any:
     """Return what JSON knows, for what a summary may hold."""
-    if isinstance(value, Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, (np.ndarray, np.generic)):
+    if isinstance(value, (Tensor, np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, Enum):
         value = value.value
