@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from torchcss.io.keypoints.one_person import size_of
+from torchcss.io.keypoints.one_person import sides_of, size_of
 from torchcss.io.keypoints.people import Size
+from torchcss.joint_names import LIMB_PLACES
 
 _CONFIDENT = 0.3
 _APART = 0.05
@@ -19,8 +20,6 @@ _APART = 0.05
 
 _DOUBTFUL = 0.3
 """Share of the usual confidence below which the first frame's keypoints are doubted."""
-
-_LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 
 
 def findings(
@@ -67,18 +66,12 @@ def _outside(joints: np.ndarray, image_size_wh: Size, first_frame: int) -> list[
     return [line]
 
 
-def _columns(names: Sequence[str], place: str) -> list[int]:
-    """Where the left and the right joint of a place stand; empty: one of them is missing."""
-    pair = [f"{side}_{place}" for side in "lr"]
-    return [list(names).index(name) for name in pair] if {*pair} <= {*names} else []
-
-
 def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     """Whether left and right of the parts of a body contradict each other."""
     sizes = np.array([size_of(person) for person in joints])
     facing: dict[str, np.ndarray] = {}  # 1 where the left one is on the right, as of who faces us
     for place in ("shoulder", "hip", "eye"):
-        columns = _columns(names, place)
+        columns = sides_of(names, place)
         if not columns:
             continue
         left, right = joints[:, columns].swapaxes(0, 1)
@@ -101,7 +94,7 @@ def _sides(joints: np.ndarray, names: Sequence[str]) -> list[str]:
 
 def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     """Whether shoulders and hips stand side by side or upside down, as with other axes."""
-    columns = _columns(names, "shoulder") + _columns(names, "hip")
+    columns = sides_of(names, "shoulder") + sides_of(names, "hip")
     if len(columns) < 4:
         return []
     seen = joints[(joints[:, columns, 2] > _CONFIDENT).all(1)][:, columns, :2]
@@ -122,7 +115,7 @@ def _lying(joints: np.ndarray, names: Sequence[str]) -> list[str]:
 
 def _turnabouts(joints: np.ndarray, names: Sequence[str]) -> list[str]:
     """Whether left and right change places from one frame to the next."""
-    pairs = [columns for place in _LIMBS if (columns := _columns(names, place))]
+    pairs = [columns for place in LIMB_PLACES if (columns := sides_of(names, place))]
     if not pairs:
         return []
     one, other = map(list, zip(*pairs, strict=True))

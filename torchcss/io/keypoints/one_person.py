@@ -243,6 +243,12 @@ def _next(
     return nearest
 
 
+def sides_of(names: Sequence[str], place: str) -> list[int]:
+    """Where the left and the right joint of a place stand; empty: one of them is missing."""
+    pair = [f"{side}_{place}" for side in "lr"]
+    return [list(names).index(name) for name in pair] if {*pair} <= {*names} else []
+
+
 def _middle(person: np.ndarray) -> np.ndarray:
     """The mean place of a person's confident joints."""
     return person[person[:, 2] > 0.0, :2].mean(0)

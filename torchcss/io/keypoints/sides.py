@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from torchcss.io.keypoints.one_person import size_of
+from torchcss.io.keypoints.one_person import sides_of, size_of
 
 _GROUPS = {
     "legs": ("hip", "knee", "ankle", "heel", "toe", "midtarsal"),
@@ -55,14 +55,10 @@ def with_sides_put_back(
     Returns:
         The same, with sides that stay the same from one frame to the next.
     """
-    put_back, column = joints.copy(), {name: index for index, name in enumerate(names)}
+    put_back = joints.copy()
     sizes = np.array([size_of(person) for person in joints])
     for group, places in _GROUPS.items():
-        pairs = [
-            (column[f"l_{place}"], column[f"r_{place}"])
-            for place in places
-            if {f"l_{place}", f"r_{place}"} <= column.keys()
-        ]
+        pairs = [columns for place in places if (columns := sides_of(names, place))]
         if not pairs:
             continue
         left, right = (list(side) for side in zip(*pairs, strict=True))
