@@ -31,7 +31,6 @@ from torchcss.body.catalog import (
     BODY_NAMES,
     BodySpecification,
     MarkerSpecification,
-    PartSpecification,
     Proportions,
     root_joints,
     scaled,
@@ -158,7 +157,7 @@ def has_free_root(name_or_path: str | Path) -> bool:
 
 def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> BodySpecification:
     """Joints, parts and landmarks of a file, hung on a root if it has or shall have one."""
-    skeleton, solids, turn = _read(path, options.units)
+    skeleton, turn = _read(path, options.units)
     if (number := len(skeleton.joints)) > MOST_LINKS:  # of an MJCF, which may repeat its bodies
         raise BodyError(f"{number:,} links; expected a robot of {MOST_LINKS:,} at most")
     if skeleton.has_root if free_root is None else free_root:
@@ -177,7 +176,7 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
     landmarks = {
         link: name for link, name in zip(skeleton.places, known, strict=True) if name is not None
     }
-    parts = solids if options.shape == "file" else ()
+    parts = skeleton.solids if options.shape == "file" else ()
     if options.shape != "none":
         # The world is no bone, nor is what carries the body in it or lies between its joints.
         bare = {joint.link for joint in joints} - set(skeleton.places)
@@ -207,22 +206,20 @@ def _from_file(path: Path, options: FileOptions, free_root: bool | None) -> Body
     )
 
 
-def _read(
-    path: Path, units: str | float | None
-) -> tuple[HungTree, tuple[PartSpecification, ...], tuple[tuple[float, ...], ...]]:
-    """Tree, solids, and how the file's frame hangs on a root that is Y up."""
+def _read(path: Path, units: str | float | None) -> tuple[HungTree, tuple[tuple[float, ...], ...]]:
+    """What a file has, and how the file's frame hangs on a root that is Y up."""
     if path.suffix.lower() == ".bvh":
         try:
             skeleton = read_bvh_skeleton(path, units=units)
         except (MotionCaptureError, ConfigurationError) as error:
             raise BodyError(str(error)) from error
-        return skeleton, (), _BVH_Y_UP if skeleton.is_z_up else _AS_IT_IS
+        return skeleton, _BVH_Y_UP if skeleton.is_z_up else _AS_IT_IS
     if units is not None:
         raise BodyError(f"{path}: units are for BVH files; this format is in metres (see scale)")
     root = parse_xml(path, "a URDF")
     if path.suffix.lower() != ".urdf" and root.tag in ("mujoco", "mujocoinclude"):
-        return *read_mjcf(path), _Y_UP
-    return *read_urdf(root, path.parent), _Y_UP
+        return read_mjcf(path), _Y_UP
+    return read_urdf(root, path.parent), _Y_UP
 
 
 def _markers(

@@ -25,6 +25,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from torchcss.body.catalog import PartSpecification
 from torchcss.body.chain import JointSpecification
 from torchcss.body.files.bvh_parser import Segment, parse_bvh, without_empty_positions
 from torchcss.body.rotations import about, as_rows, as_vector
@@ -58,7 +59,7 @@ _LEAST_PERSON, _LARGEST_PERSON = 0.5, 1.6
 
 
 class HungTree(NamedTuple):
-    """A tree that a file describes, hung on a root link of its own.
+    """A tree that a file describes, hung on a root link of its own, and what it says of its shape.
 
     Attributes:
         joints: The joints, parents first; the first entry is the root link `BASE`.
@@ -67,6 +68,7 @@ class HungTree(NamedTuple):
         places: The links that the file names, the joint of each standing at its link's origin.
         has_root: Whether the file lets the whole body move freely.
         is_z_up: Whether the file's world is Z up where others of its kind are Y up.
+        solids: Parts of the links for which the file has solids.
     """
 
     joints: tuple[JointSpecification, ...]
@@ -75,6 +77,7 @@ class HungTree(NamedTuple):
     places: tuple[str, ...]
     has_root: bool
     is_z_up: bool = False
+    solids: tuple[PartSpecification, ...] = ()
 
 
 def read_bvh_skeleton(path: Path, *, units: str | float | None = None) -> HungTree:

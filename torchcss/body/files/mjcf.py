@@ -59,14 +59,11 @@ _LIGHT = 1e-6
 """Mass and inertia that every body has at least: the compiler refuses moving ones without."""
 
 
-def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
+def read_mjcf(path: Path) -> HungTree:
     """Read tree and solids of an MJCF file.
 
     Args:
         path: The file; what it includes or attaches is looked for beside it.
-
-    Returns:
-        The tree, and the parts of the links that have solids.
 
     Raises:
         BodyError: If the file, or one that it names, is missing, no MJCF, in another folder, or
@@ -87,12 +84,12 @@ def read_mjcf(path: Path) -> tuple[HungTree, tuple[PartSpecification, ...]]:
     if len(tops) > 1:
         others = [model.body(body).name or "without name" for body in tops if body != chosen]
         notes.append(f"of several bodies the one with most joints; not {', '.join(others)}")
-    skeleton, parts = _Reader(model).read(chosen, tuple(notes))
-    bare = {*skeleton.places} - {part.link for part in parts}
+    skeleton = _Reader(model).read(chosen, tuple(notes))
+    bare = {*skeleton.places} - {part.link for part in skeleton.solids}
     if meshes := [link for link in meshed if link in bare]:
         note = unopened_meshes(meshes, "<geom>")
         skeleton = skeleton._replace(notes=(*skeleton.notes, note))
-    return skeleton, parts
+    return skeleton
 
 
 class _Screen:
@@ -222,9 +219,7 @@ class _Reader:
         self.has_root = False
         self.names: dict[int, str] = {}
 
-    def read(
-        self, chosen: int, notes: tuple[str, ...]
-    ) -> tuple[HungTree, tuple[PartSpecification, ...]]:
+    def read(self, chosen: int, notes: tuple[str, ...]) -> HungTree:
         """The tree that hangs on a body of the world, and its parts."""
         for body in np.flatnonzero(self.model.body_rootid == chosen).tolist():
             self._body(body)
@@ -233,7 +228,8 @@ class _Reader:
         del self.links[0]
         places = tuple(self.links.values())
         notes += tuple(self._couple())
-        return HungTree(tuple(self.joints), {}, notes, places, self.has_root), tuple(self.parts)
+        solids = tuple(self.parts)
+        return HungTree(tuple(self.joints), {}, notes, places, self.has_root, solids=solids)
 
     def _couple(self) -> Iterator[str]:
         """Let joints follow others by the file's equalities; yield what was left out."""

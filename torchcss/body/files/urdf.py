@@ -62,17 +62,12 @@ _ROUNDED = (0.5, 1.0, 0.0, 0.0, 0.0, 0.0)
 flat."""
 
 
-def read_urdf(
-    robot: ElementTree.Element, folder: Path
-) -> tuple[HungTree, tuple[PartSpecification, ...]]:
+def read_urdf(robot: ElementTree.Element, folder: Path) -> HungTree:
     """Tree and solids of a URDF.
 
     Args:
         robot: Its root element.
         folder: Where meshes are looked for.
-
-    Returns:
-        The tree, and the parts of the links that have solids.
 
     Raises:
         BodyError: If it is no URDF, has joints of more than one degree of freedom, repeats a name,
@@ -112,7 +107,7 @@ def read_urdf(
     solids += _boxes_of_meshes(robot, folder.resolve(), {part.link for part in solids}, notes)
     check_joints(joints)
     places = tuple(link_order(joints))
-    return HungTree(tuple(joints), {}, tuple(notes), places, floats), solids
+    return HungTree(tuple(joints), {}, tuple(notes), places, floats, solids=solids)
 
 
 def _take_off_the_world(robot: ElementTree.Element, notes: list[str]) -> bool:
