@@ -53,6 +53,9 @@ Numbers = Float[Tensor, "*batch"]
 Trajectory = Float[Tensor, "t n"]
 """A state in every frame, or a derivative in it."""
 
+Times = Float[Tensor, " t"]
+"""Seconds at which the frames were shown, increasing."""
+
 Items = Int[Tensor, " m"]
 """Which items, by index."""
 

@@ -19,7 +19,16 @@ from torch import Tensor
 from torchcss.errors import check_positive
 from torchcss.inference.band import Band, least_in_box
 from torchcss.linalg import mask_free, multiply, symmetric_part
-from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector, frozen
+from torchcss.types import (
+    Bounds,
+    Differentiable,
+    LocalModel,
+    Status,
+    Times,
+    Trajectory,
+    Vector,
+    frozen,
+)
 
 Changes = Mapping[int, Callable[[Tensor], Tensor]]
 """By the index of a frame, a differentiable map `[*batch n] -> [*batch n]` from the coordinates of
@@ -53,7 +62,7 @@ class Transition:
         return bool(torch.as_tensor(self.acceleration).isfinite().any())
 
     def deviations(
-        self, times: Float[Tensor, " t"], n: int
+        self, times: Times, n: int
     ) -> tuple[Float[Tensor, "steps n"], Float[Tensor, "changes n"]]:
         """Standard deviation of every motion, and of every change of motion, as terms count them.
 
@@ -129,7 +138,7 @@ class ChainSum(NamedTuple):
 
     cost: Differentiable
     likelihood_power: float
-    times: Float[Tensor, " t"]
+    times: Times
     transition: Transition
     changes: Changes
     dtype: torch.dtype
@@ -223,7 +232,7 @@ def held_by(x: Tensor, gradient: Tensor, bounds: Bounds) -> Bool[Tensor, "t n"]:
 def linked(
     frames: LocalModel,
     x: Trajectory,
-    times: Float[Tensor, " t"],
+    times: Times,
     transition: Transition,
     changes: Changes,
 ) -> Chain:

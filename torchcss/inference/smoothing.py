@@ -58,7 +58,16 @@ from torchcss.inference.chain import (
 )
 from torchcss.inference.trust_region import default_prior_variance
 from torchcss.linalg import multiply, solve_lower, symmetric_part, whitener, with_least_width
-from torchcss.types import Bounds, Differentiable, LocalModel, Status, Trajectory, Vector, frozen
+from torchcss.types import (
+    Bounds,
+    Differentiable,
+    LocalModel,
+    Status,
+    Times,
+    Trajectory,
+    Vector,
+    frozen,
+)
 
 
 class Path(NamedTuple):
@@ -141,7 +150,7 @@ def best_path(
     mean: Float[Tensor, "t k n"],
     covariance: Float[Tensor, "t k n n"] | None,
     cost: Float[Tensor, "t k"],
-    times: Float[Tensor, " t"],
+    times: Times,
     transition: Transition,
     *,
     changes: Changes | None = None,
@@ -173,7 +182,7 @@ def mode_weights(
     mean: Float[Tensor, "t k n"],
     covariance: Float[Tensor, "t k n n"] | None,
     cost: Float[Tensor, "t k"],
-    times: Float[Tensor, " t"],
+    times: Times,
     transition: Transition,
     *,
     power: float = 1.0,
@@ -311,7 +320,7 @@ WINDOWS = Windows()
 def refine(
     cost: Differentiable,
     start: Trajectory,
-    times: Float[Tensor, " t"],
+    times: Times,
     transition: Transition,
     bounds: Bounds,
     *,
@@ -352,7 +361,7 @@ def refine(
 def refine_in_windows(
     costs: Iterable[Differentiable],
     start: Trajectory,
-    times: Float[Tensor, " t"],
+    times: Times,
     transition: Transition,
     bounds: Bounds,
     *,
@@ -542,7 +551,7 @@ def _refined(
     )
 
 
-def _checked_times(times: Tensor, t: int) -> Float[Tensor, " t"]:
+def _checked_times(times: Tensor, t: int) -> Times:
     check_shape("times", times, t)
     if t == 0:
         raise ShapeError("smoothing: expected at least one frame, got none")
@@ -552,9 +561,7 @@ def _checked_times(times: Tensor, t: int) -> Float[Tensor, " t"]:
     return seconds
 
 
-def _checked(
-    start: Tensor, times: Tensor, bounds: Bounds
-) -> tuple[Trajectory, Float[Tensor, " t"], Bounds]:
+def _checked(start: Tensor, times: Tensor, bounds: Bounds) -> tuple[Trajectory, Times, Bounds]:
     """The start within the bounds, times and bounds of every frame, in float64."""
     check_shape("start", start, None, None)
     t, n = start.shape

@@ -34,7 +34,7 @@ from torchcss.inference.smoothing import (
     refine,
     whole_periods,
 )
-from torchcss.types import Trajectory, Vector, frozen
+from torchcss.types import Times, Trajectory, Vector, frozen
 
 _SAME_BASE = 1e-9
 
@@ -88,7 +88,7 @@ class TrackedModes(NamedTuple):
     """
 
     frames: Int[Tensor, " t"]
-    times: Float[Tensor, " t"]
+    times: Times
     bases: Float[Tensor, "t 4 4"]
     state: Float[Tensor, "t k n"]
     covariance: Float[Tensor, "t k n n"]
