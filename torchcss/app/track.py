@@ -210,7 +210,7 @@ def _begin(
         settings, first, looking, frame_interval=interval, generator=generator
     )
     body = out / FITTED_BODY_NAME
-    given = None if options.init is None else Path(options.init).resolve()
+    given = options.init and options.init.resolve()
     is_given = given in (out.resolve(), body.resolve())  # what was started from stays as it is
     recorder = Recorder(
         folder=out,
@@ -273,7 +273,10 @@ def _with_keypoints(
     """The files with keypoints that are detected, and their masks where none are given."""
     open_view(files, source, selection)
     keypoints = out / _KEYPOINTS_NAME
-    _detect(files.video, keypoints, selection, options)
+    detect_video(
+        files.video, keypoints, options.detect, frame_rate=files.frame_rate,
+        start=selection.start, stop=selection.stop,
+    )  # fmt: skip
     masks = files.masks
     if masks is None and masks_of(keypoints).is_file():
         masks = masks_of(keypoints)
@@ -345,19 +348,14 @@ def _check_for_detector(body: BodyModel) -> None:
         )
 
 
-def _detect(video: Path, keypoints: Path, selection: FrameSelection, options: TrackOptions) -> None:
-    """Find the keypoints of the frames that are tracked."""
-    detect_video(
-        video, keypoints, options.detect, frame_rate=options.frame_rate,
-        start=selection.start, stop=selection.stop,
-    )  # fmt: skip
-
-
 def _detect_further(run: Run, selection: FrameSelection, options: TrackOptions) -> None:
     """Find the keypoints anew where a run goes on beyond the frames that were looked at."""
     own, keypoints = run.cameras[0].files, _detected_by(run)
     if own is not None and keypoints is not None and not is_detected(keypoints, selection.stop):
-        _detect(own.video, keypoints, selection, replace(options, frame_rate=own.frame_rate))
+        detect_video(
+            own.video, keypoints, options.detect, frame_rate=own.frame_rate,
+            start=selection.start, stop=selection.stop,
+        )  # fmt: skip
 
 
 def _camera_of(
@@ -495,7 +493,7 @@ def _with_files(
     cameras = list(run.cameras)
     with naming(run.folder, ConfigurationError):
         if options.init is not None and "first_pose" in told:
-            _check_first_pose(told["first_pose"], Path(options.init))
+            _check_first_pose(told["first_pose"], options.init)
         if len(options.others) >= len(cameras):
             raise ConfigurationError(f"the run was begun with {len(cameras)} cameras, not more")
         for place, given in enumerate((own, *options.others)):
@@ -641,7 +639,7 @@ def _description(
         "body_lengths_m": dict(first.body.lengths),
         "frames_selected": asdict(selection),
         "fingerprints": [opened.files.fingerprints() for opened in views],
-        "first_pose": init and {"file": str(init), "fingerprint": _print_of_pose(Path(init))},
+        "first_pose": init and {"file": str(init), "fingerprint": _print_of_pose(init)},
     }
 
 
