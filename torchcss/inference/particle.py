@@ -178,15 +178,13 @@ class _Filter(SequenceTracker):
         """Gather particles into components: whose each is, the mixture, each one's heaviest."""
         # The typical distance of two draws of the dynamics' noise, squared and in its metric.
         reach = 2 * x.shape[-1]
-        left = torch.ones_like(log_weight, dtype=torch.bool)
+        left = log_weight.argsort(descending=True, stable=True)
         leaders, distances = [], []
-        while len(leaders) < self.num_modes and bool(left.any()):
-            leader = torch.where(left, log_weight, -torch.inf).argmax()
-            leader = leader if bool(left[leader]) else left.nonzero()[0, 0]
+        while len(leaders) < self.num_modes and len(left):
+            leader, left = left[0], left[1:]
             distances.append(squared_mahalanobis(x - x[leader], noise))
             leaders.append(leader)
-            left &= distances[-1] > reach
-            left[leader] = False
+            left = left[distances[-1][left] > reach]
         component = torch.stack(distances).argmin(0)
         fields = []
         for index in range(len(leaders)):
