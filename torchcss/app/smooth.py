@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from torchcss.app.view_files import FrameSelection, moments, open_run
 from torchcss.body.bases import pose_track
 from torchcss.errors import ConfigurationError, TrackFileError
 from torchcss.files import StrPath, naming, prepare_output_folder
-from torchcss.inference.smoothing import Refined
 from torchcss.initialise.view import CameraView
 from torchcss.io.run import Run, as_run, body_of_track
 from torchcss.io.tracks import SMOOTH_NAME, TRACK_NAME, Track, save_track, write_summary
@@ -98,7 +96,7 @@ def smooth_track(track: Track, choice: Smoothing | None = None) -> SmoothedTrack
     """
     choice, began = choice or Smoothing(), time.perf_counter()
     done = smooth_modes(body_of_track(track), _tensors(track), choice)
-    return _smoothed(track, done, done.refined, done.cost, choice, began)
+    return _smoothed(track, done, choice, began)
 
 
 def smooth_frames(
@@ -126,7 +124,8 @@ def smooth_frames(
         body, _tensors(track), images, settings=settings, views=views, choice=choice
     )
     refined = done.refined
-    smoothed = _smoothed(track, done.first, refined, refined.cost, choice, began)
+    found = done.first._replace(refined=refined, cost=refined.cost)
+    smoothed = _smoothed(track, found, choice, began)
     smoothed.effect.update(
         evidence_of="images",
         mean_cost_before_images=float(done.cost_at_start.mean()),
@@ -144,15 +143,9 @@ def _tensors(track: Track) -> TrackedModes:
     return TrackedModes(*arrays, likelihood_power=track.likelihood_power)
 
 
-def _smoothed(
-    track: Track,
-    first: Smoothed,
-    refined: Refined,
-    cost: Float[Tensor, " t"],
-    choice: Smoothing,
-    began: float,
-) -> SmoothedTrack:
+def _smoothed(track: Track, done: Smoothed, choice: Smoothing, began: float) -> SmoothedTrack:
     """The states as a track of one mode per frame, and what they changed."""
+    refined = done.refined
     bases = torch.from_numpy(track.base_transform)
     joints = pose_track(body_of_track(track), refined.mean, bases).joints
     parent = np.zeros((len(track.frames), 1), dtype=np.int64)
@@ -161,18 +154,18 @@ def _smoothed(
         state=refined.mean[:, None].numpy(),
         covariance=refined.covariance[:, None].numpy(),
         log_weight=np.zeros((len(track.frames), 1)),
-        cost=cost[:, None].numpy(),
+        cost=done.cost[:, None].numpy(),
         parent=parent,
         joints_world=joints[:, None].numpy(),
         likelihood_power=1 / choice.persistence if choice.persistence else track.likelihood_power,
     )
-    modes = first.modes.numpy()
+    modes = done.modes.numpy()
     effect = {
         **asdict(choice),
         "evidence_of": "modes",
         "seconds": time.perf_counter() - began,
         **_effect(track, modes, result),
-        "frames_without_evidence": track.frames[~first.seen.numpy()],
+        "frames_without_evidence": track.frames[~done.seen.numpy()],
         "states_at_a_limit": int(refined.active.sum()),
     }
     return SmoothedTrack(result, modes, effect)
