@@ -59,6 +59,9 @@ Times = Float[Tensor, " t"]
 Items = Int[Tensor, " m"]
 """Which items, by index."""
 
+ColourImage = UInt8[np.ndarray, "h w 3"]
+"""Red, green and blue, 0 to 255."""
+
 
 def as_array(tensor: Tensor) -> np.ndarray:
     """A tensor's numbers for NumPy, float64."""
@@ -314,5 +317,5 @@ class Frame:
 
     index: int
     time_s: float
-    image: UInt8[np.ndarray, "h w 3"]
+    image: ColourImage
     mask: UInt8[np.ndarray, "h w *c"] | None = None

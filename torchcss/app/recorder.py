@@ -22,9 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 from tqdm import tqdm
 
@@ -45,7 +43,7 @@ from torchcss.io.view_files import RecordedCamera
 from torchcss.show.track_pictures import draw_modes
 from torchcss.tracking.checkpoint import state_tensors
 from torchcss.tracking.session import Posterior, TrackingSession
-from torchcss.types import Status
+from torchcss.types import ColourImage, Status
 from torchcss.vision.camera import Camera
 
 CHECKPOINT_EVERY = 10.0
@@ -64,7 +62,7 @@ class Picture:
         self._frame = frame
 
     @cached_property
-    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+    def image(self) -> ColourImage:
         """The frame with its modes drawn over it."""
         frame = self._frame
         return draw_modes(frame.frame.image, frame.body, modes_of(frame), self.camera)

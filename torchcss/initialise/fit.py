@@ -17,9 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 
 from torchcss.body.load import load_body
@@ -63,11 +61,11 @@ from torchcss.initialise.result import (
 )
 from torchcss.initialise.shape import ShapeFit, fit_shape
 from torchcss.initialise.view import CameraView
-from torchcss.types import Keypoints, Vector
+from torchcss.types import ColourImage, Keypoints, Vector
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import FeatureExtractor
 
-Picture = UInt8[np.ndarray, "h w 3"] | Tensor
+Picture = ColourImage | Tensor
 """Red, green, blue."""
 
 DEFAULT_VIEW_DEGREES = 54.0

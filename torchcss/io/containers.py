@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from torchcss.errors import VideoError
 from torchcss.io.high_dynamic_range import table
 from torchcss.joint_names import names_in
+from torchcss.types import ColourImage
 
 if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
     from av import VideoFrame
@@ -158,7 +158,7 @@ def times_shown(path: Path) -> list[float | None]:
     return [time for time in times if _is_shown_by(time, sent)]
 
 
-def upright(picture: VideoFrame, stream: VideoStream) -> UInt8[np.ndarray, "h w 3"]:
+def upright(picture: VideoFrame, stream: VideoStream) -> ColourImage:
     """Return the picture as a player shows it on a screen of standard range."""
     levels = table(int(stream.codec_context.color_trc or 0))
     # One thread, as for decoding: on busy cores a picture waits longer for threads than it takes.

@@ -33,10 +33,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch.nn import functional
 
 from torchcss.errors import CameraError
+from torchcss.types import ColourImage
 
 MOST_COEFFICIENTS = {False: 14, True: 4}
 """How many coefficients a lens has, by whether it is a fisheye lens."""
@@ -247,9 +248,7 @@ class Lens(NamedTuple):
         return np.where(is_inside.all(-1, keepdims=True), pixels, np.nan)
 
 
-def straight_image(
-    image: UInt8[np.ndarray, "h w 3"], source: Float[np.ndarray, "h w 2"]
-) -> UInt8[np.ndarray, "h w 3"]:
+def straight_image(image: ColourImage, source: Float[np.ndarray, "h w 2"]) -> ColourImage:
     """A straight picture by cubic interpolation; black where nothing was recorded.
 
     Args:

@@ -14,14 +14,14 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from torchcss.errors import VideoError
 from torchcss.files import StrPath, refusing
+from torchcss.types import ColourImage
 
 
-def read_image(path: StrPath) -> UInt8[np.ndarray, "h w 3"]:
+def read_image(path: StrPath) -> ColourImage:
     """Read one image as 8-bit red, green, blue, turned upright.
 
     16-bit grey is scaled to 8 bit; transparent images are laid over black.

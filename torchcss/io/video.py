@@ -26,7 +26,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import ExifTags, Image
 
 from torchcss.errors import ConfigurationError, ShapeError, VideoError
@@ -47,7 +47,7 @@ from torchcss.io.pictures import (
     size_at_beginning,
 )
 from torchcss.joint_names import names_in
-from torchcss.types import TIME_ROUNDING, Frame
+from torchcss.types import TIME_ROUNDING, ColourImage, Frame
 
 if TYPE_CHECKING:  # PyAV takes long to import: only where a video is read or written
     from av import VideoFrame
@@ -379,7 +379,7 @@ class VideoReader:
             if size_at_beginning(self._images[index]) not in (None, self.info[1:3]):
                 self._image(index)
 
-    def _image(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+    def _image(self, index: int) -> ColourImage:
         assert self._images is not None
         image = read_image(self._images[index])
         if image.shape[:2] != (self.info.height, self.info.width):
@@ -431,7 +431,7 @@ class VideoWriter:
         self._container: Any = None
         self._stream: Any = None
 
-    def write(self, image: UInt8[np.ndarray, "h w 3"], time_s: float | None = None) -> None:
+    def write(self, image: ColourImage, time_s: float | None = None) -> None:
         """Append one frame, red, green, blue.
 
         Args:
@@ -541,7 +541,7 @@ def usual_step(steps: Float[np.ndarray, " t"]) -> float:
     return float(steps[np.abs(steps - usual) < 1.5 * TIME_ROUNDING].mean())
 
 
-def read_frame(path: StrPath, index: int = 0) -> UInt8[np.ndarray, "h w 3"]:
+def read_frame(path: StrPath, index: int = 0) -> ColourImage:
     """Read one frame of a video, or one image.
 
     Args:

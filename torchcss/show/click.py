@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from matplotlib.backend_bases import KeyEvent, MouseEvent
 from matplotlib.figure import Figure
 from matplotlib.widgets import Button
@@ -28,7 +27,7 @@ from torchcss.errors import ConfigurationError, KeypointError
 from torchcss.files import StrPath, write_text
 from torchcss.show.track_plots import bones_of, draw_bones
 from torchcss.tracking.settings import Settings
-from torchcss.types import Keypoints
+from torchcss.types import ColourImage, Keypoints
 
 CLICKED = (
     "skull_tip", "vc7",
@@ -58,7 +57,7 @@ class JointClicker:
 
     def __init__(
         self,
-        image: UInt8[np.ndarray, "h w 3"],
+        image: ColourImage,
         names: tuple[str, ...] | None = None,
         *,
         figure: Figure | None = None,
@@ -201,7 +200,7 @@ def spoken(joint: str) -> str:
 
 
 def click_joints(
-    image: UInt8[np.ndarray, "h w 3"],
+    image: ColourImage,
     names: tuple[str, ...] | None = None,
     *,
     body: str = Settings.body,

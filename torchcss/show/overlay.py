@@ -30,6 +30,7 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.errors import ConfigurationError, ShapeError, check_shape
 from torchcss.show.style import OKABE_ITO
+from torchcss.types import ColourImage
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import (
     Fragments,
@@ -159,7 +160,7 @@ def project_body(body: BodyModel, x: Float[Tensor, "k n"], camera: Camera) -> li
 
 
 def draw_poses(
-    image: UInt8[np.ndarray, "h w 3"],
+    image: ColourImage,
     body: BodyModel,
     x: Float[Tensor, "k n"],
     camera: Camera,
@@ -167,7 +168,7 @@ def draw_poses(
     weights: Float[Tensor, " k"] | None = None,
     keypoints: Float[Tensor, "j 2"] | None = None,
     text: str | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
+) -> ColourImage:
     """Draw poses of a body over the picture, the first as a shaded body.
 
     Args:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 
 from torchcss.body.model import BodyModel
 from torchcss.errors import VideoError
@@ -23,11 +22,10 @@ from torchcss.io.tracks import TRACK_NAME, FrameModes
 from torchcss.io.video import VideoReader, VideoWriter
 from torchcss.io.view_files import RecordedCamera
 from torchcss.show.overlay import draw_poses
+from torchcss.types import ColourImage
 from torchcss.vision.camera import Camera
 
 OVERLAY_NAME = "overlay.mp4"
-
-Picture = UInt8[np.ndarray, "h w 3"]
 
 
 def caption(frame: int, num_modes: int, cost: float) -> str:
@@ -110,7 +108,7 @@ def without_pictures(run: Run) -> str | None:
 
 def pictures_of(
     run: Run, rows: Iterable[int], *, anew: bool = False
-) -> Iterator[tuple[int, Picture]]:
+) -> Iterator[tuple[int, ColourImage]]:
     """Yield the pictures of some frames of a track, with its modes drawn over them.
 
     Args:
@@ -147,7 +145,7 @@ def pictures_of(
 
 def _frames_of(
     run: Run, recorded: RecordedCamera, rows: Iterable[int]
-) -> Iterator[tuple[int, Picture | None]]:
+) -> Iterator[tuple[int, ColourImage | None]]:
     """What a camera saw in some frames of the track; None where its video has none."""
     assert recorded.files is not None
     wanted = {int(run.track.frames[row]) + recorded.files.offset: int(row) for row in rows}
@@ -160,7 +158,9 @@ def _frames_of(
         yield row, frame.image if frame is not None and frame.index == index else None
 
 
-def draw_modes(image: Picture, body: BodyModel, modes: FrameModes, camera: Camera) -> Picture:
+def draw_modes(
+    image: ColourImage, body: BodyModel, modes: FrameModes, camera: Camera
+) -> ColourImage:
     """Draw the modes of a frame over its image.
 
     Args:

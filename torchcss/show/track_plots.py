@@ -35,6 +35,7 @@ from torchcss.io.video import VideoReader
 from torchcss.joint_names import canonical_joint_name
 from torchcss.show.overlay import palette_colour
 from torchcss.show.style import OKABE_ITO
+from torchcss.types import ColourImage
 from torchcss.vision.camera import Camera
 
 EXPLANATION_M = 0.12
@@ -340,7 +341,7 @@ def contact_sheet(
 
 
 def sheet_of(
-    images: Sequence[UInt8[np.ndarray, "h w 3"]],
+    images: Sequence[ColourImage],
     titles: Sequence[str],
     *,
     columns: int | None = None,
@@ -366,7 +367,7 @@ def sheet_of(
     return figure
 
 
-def shrunk(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "r s 3"]:
+def shrunk(image: ColourImage) -> UInt8[np.ndarray, "r s 3"]:
     """An image reduced to a width of `_SHEET_PX`, if it is wider."""
     height, width = image.shape[:2]
     if width <= _SHEET_PX:

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image
 from tqdm import tqdm
 
@@ -49,7 +49,7 @@ from torchcss.show.style import DEVIATIONS
 from torchcss.show.track_pictures import pictures_of
 from torchcss.show.track_plots import EXPLANATION_M, bones_of, check_not_empty, count_apart
 from torchcss.show.viewer_layout import layout, rerun, world_axes
-from torchcss.types import as_array
+from torchcss.types import ColourImage, as_array
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces
 
@@ -88,7 +88,7 @@ class ShownFrame(NamedTuple):
     """
 
     modes: FrameModes
-    picture: UInt8[np.ndarray, "h w 3"] | None = None
+    picture: ColourImage | None = None
     lost: bool = False
 
 
@@ -410,7 +410,7 @@ def _reduced(camera: Camera) -> Camera:
     return camera.resized(max(round(factor * width), 1), max(round(factor * height), 1))
 
 
-def _jpeg(picture: UInt8[np.ndarray, "h w 3"]) -> rr.EncodedImage:
+def _jpeg(picture: ColourImage) -> rr.EncodedImage:
     image = Image.fromarray(picture)
     image.thumbnail((_LARGEST_PICTURE, _LARGEST_PICTURE))
     stream = io.BytesIO()

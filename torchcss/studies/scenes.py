@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
@@ -40,7 +40,7 @@ from torchcss.studies.sequences import RecordedSequence
 from torchcss.studies.slices import StateLine, eigen_lines, joint_lines
 from torchcss.tracking.settings import Settings, make_choice, make_plan
 from torchcss.tracking.view import NOTHING_SEEN
-from torchcss.types import Bounds, Frame, Modes, Vector
+from torchcss.types import Bounds, ColourImage, Frame, Modes, Vector
 from torchcss.vision.features import FrameFeatures
 
 _REACH_M = 0.5
@@ -60,7 +60,7 @@ class Scene(NamedTuple):
     """
 
     name: str
-    image: UInt8[np.ndarray, "h w 3"]
+    image: ColourImage
     features: FrameFeatures
     cost: TrackingCost
     truth: Vector

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from torchcss.errors import KeypointError
 from torchcss.io.keypoints.people import Size
+from torchcss.types import ColourImage
 
 _JUMP = 0.5
 """How far (in sizes of the person) a person may move from one frame to the next and be the same."""
@@ -73,7 +74,7 @@ _NEW = 0.1
 
 
 def colours_of(
-    image: UInt8[np.ndarray, "h w 3"], people: Float[np.ndarray, "p j 3"], names: Sequence[str]
+    image: ColourImage, people: Float[np.ndarray, "p j 3"], names: Sequence[str]
 ) -> Float[np.ndarray, "p 2 3"]:
     """Mean colours of everybody's trunk and thighs, from 0 to 1; NaN where they are not seen.
 

@@ -24,9 +24,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -47,7 +46,7 @@ from torchcss.studies.render.renderer import (
     render_meshes,
 )
 from torchcss.studies.render.scene import SceneRenderer, Standpoint, Style, lamp, look_at
-from torchcss.types import Trajectory, Vector, frozen
+from torchcss.types import ColourImage, Trajectory, Vector, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
 
@@ -70,7 +69,7 @@ class SyntheticSequence:
         states: Its true states.
     """
 
-    frames: list[UInt8[np.ndarray, "h w 3"]]
+    frames: list[ColourImage]
     frame_rate: float
     camera: Camera
     body: BodyModel
