@@ -103,16 +103,6 @@ class Proposal(ABC):
         return self
 
 
-def _capped(covariance: Matrices, max_deviation: Deviation | None) -> Matrices:
-    """Shrink parameters whose standard deviation exceeds a limit; correlations stay."""
-    if max_deviation is None:
-        return covariance
-    limit = torch.as_tensor(max_deviation, dtype=covariance.dtype, device=covariance.device)
-    deviation = torch.linalg.diagonal(covariance).clamp(min=0).sqrt()
-    shrink = torch.where(deviation > limit, limit / deviation, 1.0)
-    return covariance * shrink[..., :, None] * shrink[..., None, :]
-
-
 _STATES_AT_ONCE = 1024
 """Samples whose covariances are held in memory together."""
 
@@ -334,7 +324,33 @@ class ScaledProposal(_RandomProposal):
 
 
 @frozen
-class CovarianceScaled(ScaledProposal):
+class _CappedProposal(ScaledProposal):
+    """A scaled proposal that goes no farther than a limit.
+
+    Attributes:
+        max_deviation: Limit on the standard deviation, one number or one per parameter; None for
+            none.
+    """
+
+    max_deviation: Deviation | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "max_deviation", finite=False)
+
+    def _scaled(self, mixture: GaussianMixture) -> GaussianMixture:
+        """The mixture, inflated; parameters beyond the limit shrink, and correlations stay."""
+        covariance = self._factor**2 * mixture.covariance
+        if self.max_deviation is not None:
+            limit = covariance.new_tensor(self.max_deviation)
+            deviation = torch.linalg.diagonal(covariance).clamp(min=0).sqrt()
+            shrink = torch.where(deviation > limit, limit / deviation, 1.0)
+            covariance = covariance * shrink[..., :, None] * shrink[..., None, :]
+        return mixture._replace(covariance=covariance)
+
+
+@frozen
+class CovarianceScaled(_CappedProposal):
     """Sample every mode's Gaussian, inflated: `N(mu_i, s Sigma_i)`, Fig. 6 step 1.
 
     Attributes:
@@ -349,22 +365,15 @@ class CovarianceScaled(ScaledProposal):
             parameter; None for none.
     """
 
-    max_deviation: Deviation | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_range(self, "max_deviation", finite=False)
-
     def law(self, mixture: GaussianMixture) -> _Law:
         """Gaussians, inflated."""
         if self._factor == 1 and self.max_deviation is None:
             return _Law(mixture)
-        covariance = _capped(self._factor**2 * mixture.covariance, self.max_deviation)
-        return _Law(mixture._replace(covariance=covariance))
+        return _Law(self._scaled(mixture))
 
 
 @frozen
-class HeavyTailed(ScaledProposal):
+class HeavyTailed(_CappedProposal):
     """Sample a Student t of every mode: mostly near, sometimes very far.
 
     Attributes:
@@ -378,18 +387,15 @@ class HeavyTailed(ScaledProposal):
             samples is `degrees / (degrees - 2)` times the scaled one where that exists.
     """
 
-    max_deviation: Deviation | None = None
     degrees_of_freedom: int = 3
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "max_deviation", finite=False)
         check_range(self, "degrees_of_freedom", least=1, hint="; 3 is usual")
 
     def law(self, mixture: GaussianMixture) -> _Law:
         """Student t's, inflated."""
-        covariance = _capped(self._factor**2 * mixture.covariance, self.max_deviation)
-        return _Law(mixture._replace(covariance=covariance), self.degrees_of_freedom)
+        return _Law(self._scaled(mixture), self.degrees_of_freedom)
 
 
 @frozen
