@@ -84,14 +84,13 @@ class LossMonitor:
             for name in costs
             if len(state.history.get(name, ())) >= self.burn_in
         }
-        if not all(math.isfinite(cost) for cost in costs.values()):
-            # What costs nothing finite is far off, whatever it is, and teaches nothing.
-            total = min(state.total + self.most - self.slack, 2 * self.threshold)
-            return state._replace(total=total, score=self.most), total > self.threshold
         # A frame of which nothing is known leaves the sum as it was.
-        score, total = 0.0, state.total
-        excess = None
-        if known:
+        score, total, excess = 0.0, state.total, None
+        finite = all(math.isfinite(cost) for cost in costs.values())
+        if not finite:
+            # What costs nothing finite is far off, whatever it is, and teaches nothing.
+            score, total = self.most, state.total + self.most - self.slack
+        elif known:
             level = sum(known.values())
             excess = sum(costs[name] - median for name, median in known.items())
             spread = 1.4826 * statistics.median(map(abs, state.excess)) if state.excess else 0.0
@@ -99,7 +98,7 @@ class LossMonitor:
             total = max(0.0, state.total + min(score, self.most) - self.slack)
         # A sum that grew without end would take as long to come back.
         total = min(total, 2 * self.threshold)
-        if total > 0.5 * self.threshold:
+        if not finite or total > 0.5 * self.threshold:
             return state._replace(total=total, score=score), total > self.threshold
         history = dict(state.history)
         for name, cost in costs.items():
