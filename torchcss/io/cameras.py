@@ -371,9 +371,9 @@ def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: P
                 return found[0]
             raise CameraError(f"{path}: no camera {name!r}; the file has {names}")
         return name
-    alone = next(iter(cameras or entries)) if len(cameras or entries) == 1 else None
-    if len(entries) == 1 or (video is None and alone is not None):
-        return next(iter(cameras or entries))
+    known = cameras or [*entries]
+    if len(known) == 1 and (video is None or len(entries) == 1):
+        return known[0]
     if video is None:
         raise CameraError(f"{path}: several cameras, {names}: say which (--camera-name)")
     exact = [name for name, entry in entries.items() if entry.video == video.name]
@@ -386,11 +386,9 @@ def _choose(path: Path, entries: Mapping[str, Entry], name: str | None, video: P
     # Motion capture systems call a film by its camera's serial number, among other things.
     numbers = re.findall("[0-9]{5,}", video.stem)
     serial = [name for name in cameras if name in numbers]
-    for found in (exact, alike, serial, pictures):
+    for found in (exact, alike, serial, pictures, known):
         if len(found) == 1:
             return found[0]
-    if alone is not None:
-        return alone
     raise CameraError(
         f"{path}: no single camera of {video.name}; say which of {names} it is (--camera-name, "
         "or --other-cameras for a further video)"

@@ -9,7 +9,7 @@ import re
 
 import numpy as np
 
-from torchcss.io.keypoints.people import People, Person
+from torchcss.io.keypoints.people import People, with_joints
 
 _PLACES = {
     "head": "nose", "forearm": "elbow", "hand": "wrist", "upLeg": "hip", "leg": "knee",
@@ -40,13 +40,9 @@ def in_plain_words(people: People) -> People:
     if not len(trunks) or (trunks[:, :2].mean(1) > trunks[:, 2:].mean(1)).mean() <= 0.5:
         return people
     return people._replace(
-        frames={key: [*map(_turned, frame)] for key, frame in people.frames.items()},
+        frames=with_joints(people.frames, lambda joints: joints * (1, -1, 1) + (0, 1, 0)),
         report=[*report, "y counts upwards, as in Apple's Vision: turned over"],
     )
-
-
-def _turned(person: Person) -> Person:
-    return person._replace(joints=person.joints * (1, -1, 1) + (0, 1, 0))
 
 
 def _plain(name: str) -> str:

@@ -49,6 +49,7 @@ from torchcss.io.keypoints.people import (
     number_array,
     one_size,
     united,
+    with_joints,
 )
 from torchcss.io.keypoints.tables import people_of_rows, rows_of_json
 from torchcss.io.keypoints.words import (
@@ -420,6 +421,6 @@ def _read_vitpose(path: Path, content: Mapping[str, Any]) -> People:
     names = tuple(map(str, names.values() if isinstance(names, dict) else listed(names)))
     frames: Frames = {}
     for index, entry in enumerate(content["keypoints"]):
-        people = people_of(f"{path}: frame {index}", entry)
-        frames[index] = [person._replace(joints=person.joints[:, [1, 0, 2]]) for person in people]
+        frames[index] = people_of(f"{path}: frame {index}", entry)
+    frames = with_joints(frames, lambda joints: joints[:, [1, 0, 2]])
     return People(frames, names or None, ["format: easy_ViTPose (y before x)"], in_order=True)

@@ -19,6 +19,7 @@ from torchcss.io.keypoints.people import (
     Frames,
     Names,
     joint_counts,
+    with_joints,
 )
 from torchcss.joint_names import ALIASES, CASE, names_in
 
@@ -65,10 +66,7 @@ def reordered(frames: Frames, names: Sequence[str]) -> tuple[Frames, Names | Non
         order = [plain.index(name) for name in MEDIAPIPE_NAMES]
     else:
         return frames, tuple(names) or None
-    return {
-        key: [person._replace(joints=person.joints[order]) for person in people]
-        for key, people in frames.items()
-    }, None
+    return with_joints(frames, lambda joints: joints[order]), None
 
 
 def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
@@ -89,14 +87,13 @@ def _by_number(frames: Frames, numbers: Sequence[int]) -> Frames:
             )
         first = firsts[0]
     place = [number - first for number in numbers]
-    found: Frames = {}
-    for key, people in frames.items():
-        found[key] = []
-        for person in people:
-            joints = np.zeros((high - first + 1, 3))
-            joints[place] = person.joints
-            found[key].append(person._replace(joints=joints))
-    return found
+
+    def in_place(joints: np.ndarray) -> np.ndarray:
+        found = np.zeros((high - first + 1, 3))
+        found[place] = joints
+        return found
+
+    return with_joints(frames, in_place)
 
 
 def check_not_in_space(frames: Sequence[np.ndarray]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,6 +107,19 @@ def united(frames: Frames) -> tuple[Frames, Names | None]:
             joints[[place[name] for name in person.names]] = person.joints
             found[key].append(Person(joints, person.track))
     return found, names
+
+
+def with_joints(frames: Frames, change: Callable[[np.ndarray], np.ndarray]) -> Frames:
+    """The same people with other joints.
+
+    Args:
+        frames: The people.
+        change: What makes them of someone's joints `[j 3]`.
+    """
+    return {
+        key: [person._replace(joints=change(person.joints)) for person in people]
+        for key, people in frames.items()
+    }
 
 
 def one_size(sizes: Collection[Any]) -> Any:

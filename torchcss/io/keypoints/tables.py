@@ -46,6 +46,7 @@ from torchcss.io.keypoints.people import (
     Person,
     joint_counts,
     screened,
+    with_joints,
 )
 from torchcss.joint_names import CASE, names_in
 
@@ -205,9 +206,8 @@ def _without_hands(
     if not any(is_body) or not others or not all(re.fullmatch("[1-9][0-9]{2}", n) for n in others):
         return frames, joints
     report.append("points numbered from 100 on, of hands and face, are left out")
-    for people in frames.values():
-        people[:] = [person._replace(joints=person.joints[is_body]) for person in people]
-    return frames, [name for name, own in zip(joints, is_body, strict=True) if own]
+    own_joints = [name for name, own in zip(joints, is_body, strict=True) if own]
+    return with_joints(frames, lambda all_joints: all_joints[is_body]), own_joints
 
 
 def _told(columns: _Columns, heading: Sequence[str]) -> list[str]:
