@@ -126,7 +126,8 @@ class Lens(NamedTuple):
             shrunk = np.arctan if self.mirror is None else self.mirror.shrunk
             safe = np.maximum(radius, _LEAST)
             places, radius = places * shrunk(safe) / safe, shrunk(radius)
-        seen = self._bent(np.where(radius < self._limit()[0], places, np.nan))
+        limit, _, _ = _radial(*self[1:])
+        seen = self._bent(np.where(radius < limit, places, np.nan))
         return seen @ self.K[:2, :2].T + self.K[:2, 2]
 
     def places(
@@ -139,7 +140,7 @@ class Lens(NamedTuple):
                 are.
         """
         target = (pixels - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
-        limit, radii, bent_radii = self._limit()
+        limit, radii, bent_radii = _radial(*self[1:])
         far = np.linalg.norm(target, axis=-1, keepdims=True)
         direction = target / np.where(far > 0, far, 1.0)
         place = direction * np.interp(far, bent_radii, radii)
@@ -185,10 +186,6 @@ class Lens(NamedTuple):
         tilt = _tilt(tilt_x, tilt_y)
         x, y, w = np.moveaxis(bent @ tilt[:, :2].T + tilt[:, 2], -1, 0)
         return np.stack([x / w, y / w], axis=-1)
-
-    def _limit(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Up to which radius (or angle) the radial part grows, and its values up to there."""
-        return _radial(self.coefficients, self.is_fisheye, self.mirror)
 
     def straightened_K(
         self, image_size_wh: tuple[int, int], fov: float | None = None

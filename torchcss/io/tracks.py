@@ -446,7 +446,7 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
                 f"{path}: {name} holds {what}; the file was not written by torchcss"
             )
         if array.dtype.kind == "U":
-            values[name] = tuple(str(entry) for entry in array)
+            values[name] = tuple(map(str, array))
         else:
             values[name] = array.astype(np.float64 if array.dtype.kind == "f" else np.int64)
     if (values["frames"] < 0).any() or (np.diff(values["frames"]) <= 0).any():
@@ -455,10 +455,10 @@ def _checked_arrays(arrays: Mapping[str, np.ndarray], path: Path) -> dict[str, A
     if (empty := (values["log_weight"] == -np.inf).all(1)).any():
         raise TrackFileError(f"{path}: row {empty.argmax()}: no mode; expected one or more a frame")
     power = float(values.pop(_POWER_KEY))
-    if not 0 < power < np.inf:
+    if power <= 0:
         raise TrackFileError(f"{path}: {_POWER_KEY}: expected a positive power, got {power:g}")
     values["size_deviation"] = float(values["size_deviation"])
-    if not 0 <= values["size_deviation"] < np.inf:
+    if values["size_deviation"] < 0:
         raise TrackFileError(f"{path}: size_deviation: expected a number that is not negative")
     return {**values, "likelihood_power": power}
 

@@ -67,7 +67,6 @@ class _Place:
     carrier: str
     """The link that carries the bone from the place above."""
     below: list[_Place] = field(default_factory=list)
-    links: list[str] = field(default_factory=list)
     names: set[str] = field(default_factory=set)
 
     @property
@@ -103,7 +102,7 @@ def bone_parts(
             for the links where one does.
         skip: Links that have parts of their own: the bones that they carry get none.
     """
-    places, reach = _places(joints, landmarks)
+    places, _, reach = _places(joints, landmarks)
     bones = [place for place in places if place.above is not None]
     kinds = {bone: _bone_kind(bone) for bone in bones}
     radius = {
@@ -176,8 +175,7 @@ def touching_parts(
     joints: Sequence[JointSpecification], parts: Sequence[PartSpecification]
 ) -> tuple[tuple[str, str], ...]:
     """Pairs of parts that touch in every pose: of one link or the next, or that overlap at rest."""
-    places, _ = _places(joints, {})
-    place_of = {link: place for place in places for link in place.links}
+    _, place_of, _ = _places(joints, {})
     poses = rest_poses(joints)
     shapes = torch.tensor([part.shape for part in parts], dtype=torch.float64).reshape(-1, 9)
     frames = torch.from_numpy(
@@ -203,8 +201,8 @@ def touching_parts(
 
 def _places(
     joints: Sequence[JointSpecification], landmarks: Mapping[str, str]
-) -> tuple[list[_Place], float]:
-    """The places of a tree, the root's first, and how far the body reaches."""
+) -> tuple[list[_Place], dict[str, _Place], float]:
+    """The places of a tree, the root's first, that of every link, and how far the body reaches."""
     poses = rest_poses(joints)
     reach = max(1e-9, max(float(np.linalg.norm(pose[:3, 3])) for pose in poses.values()))
     places: list[_Place] = []
@@ -220,10 +218,9 @@ def _places(
             if above is not None:
                 above.below.append(place)
         place_of[joint.link] = place
-        place.links.append(joint.link)
         if joint.link in landmarks:
             place.names.add(landmarks[joint.link])
-    return places, reach
+    return places, place_of, reach
 
 
 def _bone_kind(bone: _Place) -> tuple[str, float]:

@@ -145,11 +145,10 @@ def select(
     rate = _rate(track, kept, report)
 
     present = ranks >= 0
-    row = np.arange(len(kept))[:, None].repeat(len(wanted), axis=1)
     # Where each pose is from: its own frame, or the nearest that has the mode.
     source = _nearest_present(present)
     nearest = (kept[source], ranks[source, np.arange(len(wanted))])
-    own = (kept[row], np.where(present, ranks, 0))
+    own = (kept[:, None], np.where(present, ranks, 0))
     change = np.eye(4)
     change[:3, :3] = turn
     joints = np.where(present[..., None, None], track.joints_world[own], np.nan)
