@@ -161,11 +161,15 @@ class SceneRenderer:
         return render_meshes(meshes, self.camera, background=behind, shade=light.shade)
 
 
+def level(direction: Tensor) -> Tensor:
+    """A direction without its vertical part, as a unit vector."""
+    return functional.normalize(direction * direction.new_tensor([1.0, 0.0, 1.0]), dim=-1)
+
+
 def _level_axes(camera: Camera) -> Float[Tensor, "3 3"]:
     """Axes of the scene in rows: right and towards the camera, both level, and up between them."""
-    back = -camera.R_camera_world[2]
+    back = level(-camera.R_camera_world[2])
     up = back.new_tensor([0.0, 1.0, 0.0])
-    back = functional.normalize(back - up * (back @ up), dim=-1)
     return torch.stack([torch.linalg.cross(up, back), up, back])
 
 

@@ -27,7 +27,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from torchcss.body.load import load_body
 from torchcss.body.model import BodyModel
@@ -45,7 +44,14 @@ from torchcss.studies.render.renderer import (
     random_texture,
     render_meshes,
 )
-from torchcss.studies.render.scene import SceneRenderer, Standpoint, Style, lamp, look_at
+from torchcss.studies.render.scene import (
+    SceneRenderer,
+    Standpoint,
+    Style,
+    lamp,
+    level,
+    look_at,
+)
 from torchcss.types import ColourImage, Trajectory, Vector, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, join_faces
@@ -296,10 +302,7 @@ def _place(joints: Float[Tensor, "t j 3"], camera: Camera, floor: float) -> Stan
     """Where the motion is, seen from the camera."""
     lowest, highest = joints.amin((0, 1)), joints.amax((0, 1))
     middle = 0.5 * (lowest + highest)
-    away = camera.R_camera_world[2].clone()
-    away[1] = 0
-    away = functional.normalize(away, dim=-1)
-    behind = float(((joints - middle) @ away).max())
+    behind = float(((joints - middle) @ level(camera.R_camera_world[2])).max())
     return Standpoint(middle, floor, behind + 0.15)
 
 
@@ -476,9 +479,7 @@ def camera_in_front(
     lowest, highest = points.amin((0, 1)), points.amax((0, 1))
     middle = 0.5 * (lowest + highest)
     link = int(body.part_link[0])
-    front = body.pose(states[0]).tree.rotation[link, :, 2].clone()
-    front[1] = 0
-    front = functional.normalize(front, dim=-1)
+    front = level(body.pose(states[0]).tree.rotation[link, :, 2])
     aside = torch.stack([front[2], front[1], -front[0]])
     away = math.cos(azimuth) * front + math.sin(azimuth) * aside + height * front.new_tensor(_UP)
     distance = 1.0
