@@ -23,7 +23,6 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from common import Table, finish, start
-from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.cli.options import SettingsOptions
@@ -33,7 +32,7 @@ from torchcss.studies.comparison import find_start, track_together
 from torchcss.studies.evaluation import Thresholds
 from torchcss.studies.sequences import read_sequence
 from torchcss.tracking.settings import Settings
-from torchcss.types import Curvature, LocalModel, frozen
+from torchcss.types import Curvature, LocalModel, Numbers, Vectors, frozen
 
 SETTINGS = Settings()
 
@@ -66,11 +65,11 @@ class RecordingEngine:
     def __init__(self) -> None:
         self.asked: list[tuple[TrackingCost, Tensor]] = []
 
-    def value(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, cost: TrackingCost, x: Vectors) -> Numbers:
         """See `TrackingCost.value`."""
         return replace(cost, engine=None).value(x)
 
-    def local_model(self, cost: TrackingCost, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, cost: TrackingCost, x: Vectors) -> LocalModel:
         """See `TrackingCost.local_model`."""
         self.asked.append((replace(cost, engine=None), x))
         return replace(cost, engine=None).local_model(x)

@@ -35,7 +35,7 @@ from torchcss.inference.proposals import CovarianceScaled
 from torchcss.studies.comparison import find_start, plan_of
 from torchcss.studies.sequences import RecordedSequence
 from torchcss.tracking.settings import Settings
-from torchcss.types import CostFunction, LocalModel, frozen
+from torchcss.types import CostFunction, LocalModel, Numbers, Vectors, frozen
 
 ERRORS = "root_aligned_mm", "root_aligned_best_of_modes_mm"
 """What the table shows of each tracker."""
@@ -70,14 +70,14 @@ class Scores:
     num_kept: int
     noted: list[tuple[float, float]]
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: Vectors) -> Numbers:
         """The score, nats."""
         scores = self.edges.value(x), self.full.value(x)
         if not math.isnan(correlation := rank_correlation(*scores)):
             self.noted.append((correlation, same_best(*scores, self.num_kept)))
         return scores[0]
 
-    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, x: Vectors) -> LocalModel:
         """That of the cost which scores."""
         return self.edges.local_model(x)
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from peers.reprojection_kernel import Reprojection, Scratch, add_reprojection
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from torchcss.cost.fused.records import Array, Points, Result, Tree
 from torchcss.errors import ConfigurationError, check_shape
 from torchcss.kernels.checked import run
 from torchcss.studies.reprojection import ReprojectionCost
-from torchcss.types import BlendedCost, LocalModel
+from torchcss.types import BlendedCost, LocalModel, Numbers, Vectors
 
 
 @dataclass(frozen=True)
@@ -62,17 +61,15 @@ class CompiledReprojection(BlendedCost):
         """The cost restricted to some samples: the same for all of them."""
         return self
 
-    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
+    def value(self, x: Vectors) -> Numbers:
         """Cost in nats."""
         return self._evaluated(x, None, 0).value
 
-    def local_model(self, x: Float[Tensor, "*batch n"]) -> LocalModel:
+    def local_model(self, x: Vectors) -> LocalModel:
         """Cost, gradient and exact Hessian."""
         return self._evaluated(x, None, x.shape[-1])
 
-    def blended_model(
-        self, x: Float[Tensor, "*batch n"], share: Float[Tensor, "*batch"]
-    ) -> LocalModel:
+    def blended_model(self, x: Vectors, share: Numbers) -> LocalModel:
         """See `ReprojectionCost.blended_model`."""
         return self._evaluated(x, share, x.shape[-1])
 
