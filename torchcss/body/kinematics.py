@@ -216,11 +216,12 @@ class KinematicTree(nn.Module):
         batch = q.shape[:-1]
         flat = q.reshape(batch.numel(), self.num_joints)
         base = torch.eye(3, 4).to(q) if base is None else base
-        if _plain(base) is not None and (values := _plain(flat)) is not None:
+        plain = base.dim() == 2 and _plain(base) is not None
+        if plain and (values := _plain(flat)) is not None:
             posed = self._pose_links(values, base)
             return TreePose(*(torch.from_numpy(p.reshape(*batch, *p.shape[1:])) for p in posed))
         frames = self.frames(flat, base)
-        links = _followed_by(frames[self.link_place], self.link_constant)
+        links = _followed_by(frames[self.link_place], _innermost(self.link_constant, 3, len(flat)))
         parts = (links[:, :, :3], links[:, :, 3], *self.twists(frames))
         return TreePose(
             *(p.movedim(-1, 0).unflatten(0, batch) if batch else p[..., 0] for p in parts)
@@ -250,13 +251,14 @@ class KinematicTree(nn.Module):
         With `twists` and `points` this is what a cost of few points needs, without the poses of all
         links; the batch is innermost. For the arguments see `forward`.
         """
+        constants = _innermost(self.joint_constant, 3, len(q))
         q = q.T[self.joint_order].contiguous()
         revolute = self.is_revolute[self.joint_order, None]
         angle, slide = torch.where(revolute, q, 0.0), torch.where(revolute, 0.0, q)[:, None, None]
         cosine, sine = angle.cos()[:, None, None], angle.sin()[:, None, None]
         sizes = [level.size for level in self._levels]
-        parts = (self.parent_place, self.joint_constant, cosine, sine, slide)
-        frames = base[None, :, :, None].expand(1, 3, 4, q.shape[1])
+        parts = (self.parent_place, constants, cosine, sine, slide)
+        frames = _innermost(base, 2, q.shape[1])[None].expand(1, 3, 4, q.shape[1])
         levels = [frames]
         for level, place, constant, c, s, d in zip(
             self._levels, *(part.split(sizes) for part in parts), strict=True
@@ -303,7 +305,7 @@ class KinematicTree(nn.Module):
         """
         constant = self.link_constant[link]
         place = (constant[:, :, :3] * offset[:, None, :]).sum(-1) + constant[:, :, 3]
-        return _followed_by(frames[self.link_place[link]], place[:, :, None])[:, :, 0]
+        return _followed_by(frames[self.link_place[link]], place[:, :, None, None])[:, :, 0]
 
 
 def _plain(q: Tensor) -> np.ndarray | None:
@@ -326,14 +328,22 @@ class _Level(NamedTuple):
     slides: bool
 
 
+def _innermost(constant: Tensor, axes: int, count: int) -> Float[Tensor, "*rest #b"]:
+    """A constant as of a batch of so many; several trees, `[S 1 ...]`, have as many each."""
+    if constant.dim() == axes:
+        return constant[..., None]
+    each = constant.flatten(0, -1 - axes)
+    return each.repeat_interleave(count // len(each), 0).movedim(0, -1)
+
+
 def _followed_by(
-    frames: Float[Tensor, "m 3 4 b"], constant: Float[Tensor, "m 4 c"]
+    frames: Float[Tensor, "m 3 4 b"], constant: Float[Tensor, "m 4 c #b"]
 ) -> Float[Tensor, "m 3 c b"]:
     """Frames times constant matrices, entry by entry.
 
     A matrix product would take as long, and round the same item differently in other batches.
     """
-    rows, (first, *columns) = constant[:, None, :, :, None].unbind(2), frames.chunk(4, dim=2)
+    rows, (first, *columns) = constant[:, None].unbind(2), frames.chunk(4, dim=2)
     product = first * rows[0]
     for column, row in zip(columns, rows[1:], strict=True):
         product = torch.addcmul(product, column, row)

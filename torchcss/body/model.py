@@ -308,7 +308,7 @@ class BodyModel(nn.Module):
             ShapeError: If the state has another size or type than the body.
         """
         self.check_state(x)
-        base = torch.cat([self.base_rotation, self.base_translation[:, None]], dim=1)
+        base = torch.cat([self.base_rotation, self.base_translation[..., None]], dim=-1)
         tree = self.tree(x @ self.tie.T + self.offset, base)
         return BodyPose(x, tree, self.points_on_links(tree, self.marker_link, self.marker_offset))
 

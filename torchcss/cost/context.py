@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel
 from torchcss.inference.mixture import GaussianMixture
@@ -22,6 +23,7 @@ from torchcss.vision.features import FrameFeatures, Window
 from torchcss.vision.sampling import gaussian_blur
 
 _T = TypeVar("_T")
+_M = TypeVar("_M", bound=nn.Module)
 
 Foreground = tuple[Float[Tensor, "layers y x"], Window | None]
 """See `FrameContext.foreground`."""
@@ -43,11 +45,44 @@ class BodyTables:
         self.body = body
         self._made: dict[Any, Any] = {type(table): table for table in known}
 
+    @classmethod
+    def together(cls, body: BodyModel, each: Sequence[BodyTables]) -> BodyTables:
+        """The tables of several bodies, as far as they are made; `body` stands for all."""
+        tables = cls(body)
+        for make in each[0]._made:
+            own = [other.of(make) for other in each]
+            # What is no module is made of names, which all have in common.
+            is_module = isinstance(own[0], nn.Module)
+            tables._made[make] = stack_modules(own) if is_module else own[0]
+        return tables
+
     def of(self, make: Callable[[BodyModel], _T]) -> _T:
         """The table that a class or function makes of a body."""
         if make not in self._made:
             self._made[make] = make(self.body)
         return self._made[make]
+
+
+def stack_modules(each: Sequence[_M], *names: str) -> _M:
+    """A module that stands for several: with buffers `[S 1 ...]` in place of each one's.
+
+    Args:
+        each: Modules alike but for the numbers in their buffers.
+        names: These buffers; by default those that differ.
+    """
+    stacked = copy(each[0])
+    stacked._buffers = dict(each[0]._buffers)
+    for name in names or stacked._buffers:
+        own = [one.get_buffer(name) for one in each]
+        stacked._buffers[name] = torch.stack(own)[:, None] if names else stack_different(own)
+    return stacked
+
+
+def stack_different(each: Sequence[Tensor]) -> Tensor:
+    """The tensor that all are, or all of them, `[S 1 ...]`."""
+    first, *others = each
+    same = all(one is first or torch.equal(one, first) for one in others)
+    return first if same else torch.stack(list(each))[:, None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

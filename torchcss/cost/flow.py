@@ -141,6 +141,7 @@ class FlowTerm(Term):
     kind = "image"
     watched = True
     of_motion = True
+    of_several = True
 
     weight: float = 20.0
     sigma: float = 0.5

@@ -67,7 +67,7 @@ class NearNodes(NamedTuple):
 
     Attributes:
         item: Pose of every near pair (the batch is flattened).
-        pair: Which ordered pair of `InterpenetrationPairs` it is.
+        pair: Which ordered pair of `InterpenetrationPairs` it is; of several bodies counted on.
         rotation: Orientation of its part B in the world.
         centre: Centre of its part B, metres.
         owner: Near pair of every node.
@@ -159,12 +159,13 @@ class InterpenetrationPairs(nn.Module):
             pose: Any number of posed bodies.
             reach: The R at which the potential of a part ends.
         """
-        parts = len(self.nodes)
+        parts, num_nodes = self.nodes.shape[-3:-1]
         rotation, centre = body.part_poses(pose)
-        items = pose.x.shape[:-1].numel()
+        items, bodies = pose.x.shape[:-1].numel(), self.nodes.shape[:-3].numel()
         rotation, centre = rotation.reshape(items, parts, 3, 3), centre.reshape(items, parts, 3)
-        outer = reach * self.extent
-        inner = self.nodes.abs().amax(dim=1)
+        # The parts of several bodies are rows one after the other, and each has as many items.
+        nodes, outer = self.nodes.reshape(-1, num_nodes, 3), reach * self.extent.reshape(-1, 3)
+        inner = nodes.abs().amax(dim=1)
         axes = rotation.transpose(-1, -2).flatten(1, 2)  # three rows for every part
         own = (rotation * centre[..., None]).sum(-2).flatten(1)
         distance = (axes @ centre.transpose(-1, -2) - own[..., None]).abs()
@@ -176,8 +177,11 @@ class InterpenetrationPairs(nn.Module):
 
         def overlap(half: Tensor, other: Tensor) -> Tensor:
             """Whether boxes overlap along the axes of the part in the row."""
-            spread = cosines @ (own_axes * other.flatten()[:, None])
-            gap = distance - half.flatten()[:, None] - spread
+            half, other = half.flatten()[:, None], other.flatten()[:, None]
+            if bodies > 1:
+                boxes = (box.reshape(bodies, -1, 1) for box in (half, other))
+                half, other = (box.repeat_interleave(items // bodies, 0) for box in boxes)
+            gap = distance - half - cosines @ (own_axes * other)
             first, second, third = (gap <= 0).unflatten(1, (parts, 3)).unbind(2)
             return first & second & third
 
@@ -185,12 +189,16 @@ class InterpenetrationPairs(nn.Module):
         item, pair = close[:, self.second, self.first].nonzero(as_tuple=True)
         a, b = self.first[pair], self.second[pair]
         frame, origin = rotation[item, b], centre[item, b]
+        turn = rotation[item, a].transpose(-1, -2) @ frame
+        shift = (centre[item, a] - origin)[:, None, :] @ frame
+        if bodies > 1:
+            number = item // (items // bodies)
+            pair, a, b = pair + self.num_pairs * number, a + parts * number, b + parts * number
         # In units of the box of B, so that the test is against 1.
         scale = 1 / outer[b][:, None, :]
-        turn = rotation[item, a].transpose(-1, -2) @ frame * scale
-        shift = (centre[item, a] - origin)[:, None, :] @ frame * scale
+        turn, shift = turn * scale, shift * scale
         # Component by component: on a CPU many times faster than small matrix products.
-        nodes = self.nodes.movedim(-1, 0).contiguous().index_select(1, a)
+        nodes = nodes.movedim(-1, 0).contiguous().index_select(1, a)
         scaled = []
         for axis in range(3):
             along = shift[:, :, axis]
@@ -199,7 +207,7 @@ class InterpenetrationPairs(nn.Module):
             scaled.append(along)
         inside = (scaled[0].abs() < 1) & (scaled[1].abs() < 1) & (scaled[2].abs() < 1)
         index = inside.flatten().nonzero()[:, 0]
-        owner = index // max(self.nodes.shape[1], 1)
+        owner = index // max(num_nodes, 1)
         points = torch.stack([part.flatten().index_select(0, index) for part in scaled]).mT
         return NearNodes(item, pair, frame, origin, owner, points * outer[b[owner]])
 
@@ -207,9 +215,16 @@ class InterpenetrationPairs(nn.Module):
         self, near: NearNodes
     ) -> tuple[Float[Tensor, " p"], Float[Tensor, "p 3"], Float[Tensor, "p 3 3"]]:
         """`R^2` of nodes with its first and second derivatives in their position in B's frame."""
-        part = self.second[near.pair][near.owner]
-        shape = Superquadrics._make(self.table.index_select(1, part).unbind(0))
+        table, part = self.table, self.second[self._pair(near)]
+        if table.dim() > 2:
+            part = part + table.shape[-1] * (near.pair // self.num_pairs)
+            table = table.movedim(-2, 0).flatten(1)
+        shape = Superquadrics._make(table.index_select(1, part[near.owner]).unbind(0))
         return radial_hessian(shape, *near.points.unbind(-1), bent=self.bent)
+
+    def _pair(self, near: NearNodes) -> Int[Tensor, " m"]:
+        """Which pair each is, whatever the body."""
+        return near.pair if self.table.dim() == 2 else near.pair % self.num_pairs
 
     def lift(
         self,
@@ -234,7 +249,8 @@ class InterpenetrationPairs(nn.Module):
         rows = torch.stack(point_moments(*(field.unbind(-1) for field in fields)), dim=-1)
         sums = rows.new_zeros(len(near.item), rows.shape[-1]).index_add(0, near.owner, rows)
         # Twists of the chain about the centre of B, in B's frame.
-        chain, sign = self.chain[near.pair], self.sign[near.pair][..., None]
+        pair = self._pair(near)
+        chain, sign = self.chain[pair], self.sign[pair][..., None]
         row = near.item[:, None] * joints + chain
         omega = sign * pose.tree.omega.reshape(-1, 3)[row]
         velocity = sign * pose.tree.velocity.reshape(-1, 3)[row]
@@ -312,6 +328,7 @@ class Interpenetration(Term):
 
     name = "interpenetration"
     kind = "prior"
+    of_several = True
 
     weight: float = 5.0
     p: float = 1.0
@@ -392,7 +409,7 @@ class Interpenetration(Term):
         self, square: Float[Tensor, " p"], pairs: InterpenetrationPairs
     ) -> Iterator[Tensor]:
         """Cost of nodes and its first and second derivatives in `R^2`."""
-        scale, end = self.weight / pairs.nodes.shape[1], END ** (1 / self.p)
+        scale, end = self.weight / pairs.nodes.shape[-2], END ** (1 / self.p)
         f = (self.sharpness * (square - 1)).clamp(max=end)
         power = f.abs() ** (self.p - 1)
         u, du = f * power, self.p * self.sharpness * power

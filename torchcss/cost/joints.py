@@ -116,6 +116,7 @@ class JointTerm(Term):
     name = "joints"
     kind = "image"
     watched = True
+    of_several = True
 
     weight: float = 1.0
     sigma: float = 3.0

@@ -118,7 +118,7 @@ class OutlineTerm(Term):
             image: What the term looks at.
             at: Where the nodes have moved since, with all that was found held.
         """
-        seen, model = _in_image(nodes, camera)
+        seen, model, camera = _in_image(nodes, camera)
         uv = None
         if at is not None:
             uv = camera.project(at.flatten(0, -2).index_select(0, seen.place)).uv
@@ -136,7 +136,7 @@ class OutlineTerm(Term):
             image: What the term looks at.
             gauss_newton: Leave the curvature of the projection out.
         """
-        seen, model = _in_image(nodes, camera)
+        seen, model, camera = _in_image(nodes, camera)
         match, gradient, hessian = self.derivatives(seen, image)
         match = model.valid * match
         cost = camera.pull_back(model, match, gradient, hessian, gauss_newton=gauss_newton)
@@ -148,16 +148,17 @@ class OutlineTerm(Term):
         return nodes.cost(self.matched(match), back_facing, self.occlusion_factor)
 
 
-def _in_image(nodes: SeenNodes, camera: Camera) -> tuple[ImageNodes, ProjectionModel]:
-    """The nodes of the whole batch that count at all, in the image, and their projection."""
+def _in_image(nodes: SeenNodes, camera: Camera) -> tuple[ImageNodes, ProjectionModel, Camera]:
+    """The nodes of the whole batch that count, in the image, their projection and their camera."""
     index = places(nodes.visible * nodes.exists > 0)
     last = nodes.exists.dim() - 1
     points, normals, exists, visible = (
         part.flatten(0, last).index_select(0, index) for part in nodes
     )
+    camera = camera.of_rows(index, nodes.exists.numel())
     model = camera.project_with_derivatives(points)
     normal = camera.image_normals(model, normals)
-    return ImageNodes(index, model.uv, normal, visible * exists * model.valid), model
+    return ImageNodes(index, model.uv, normal, visible * exists * model.valid), model, camera
 
 
 def _spread(

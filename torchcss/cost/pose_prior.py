@@ -429,6 +429,7 @@ class PosePrior(Term):
 
     name = "pose_prior"
     kind = "prior"
+    of_several = True
 
     def prepare(self, context: FrameContext) -> OnStates | None:
         """Bind the prior to a body; None if it lacks the limbs of a person."""

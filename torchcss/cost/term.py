@@ -56,6 +56,8 @@ class Term(Protocol):
         of_past: Whether it says what the modes before make likely: it guides descents, and is left
             out where the weights of those modes are multiplied in.
         of_motion: Whether it says how a pose differs from the mode before that it came from.
+        of_several: Whether what is bound serves several sequences at once, see
+            `torchcss.cost.batched`; priors of which it is false are evaluated one by one.
     """
 
     name: ClassVar[str]
@@ -64,6 +66,7 @@ class Term(Protocol):
     screens: ClassVar[bool] = False
     of_past: ClassVar[bool] = False
     of_motion: ClassVar[bool] = False
+    of_several: ClassVar[bool] = False
 
     @property
     def needs(self) -> frozenset[Need]:

@@ -14,7 +14,7 @@ weights").
 
 Samples of several sequences (other bodies, cameras, pictures) may be evaluated together: each
 sample has the index of its sequence, and of its parent among the modes of that sequence. One
-sequence is the case of one.
+sequence is the case of one. `torchcss.cost.batched` makes one evaluation of those that are alike.
 
 | name | term or prior | section of [IJRR] |
 |---|---|---|
@@ -47,6 +47,7 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
 from torchcss.body.model import BodyModel, BodyPose
+from torchcss.cost.batched import merged, rows_of
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.term import BoundImage, Kind, Posed, Term, differentiate_twice
@@ -336,13 +337,13 @@ class TrackingCost:
         def values(part: _Part) -> dict[str, Tensor]:
             return {**dict.fromkeys(names, part.x.new_zeros(len(part.x))), **part.weights(body)}
 
-        return self._evaluated(values, x) if names and x.numel() else {}
+        return self._evaluated(values, x, apart=True) if names and x.numel() else {}
 
     @property
     def _chunk(self) -> int:
-        """Samples to evaluate at a time."""
-        nodes = 1
-        for view in self.views:
+        """Samples to evaluate at a time, by what each has to do in the views of its sequence."""
+        nodes, number = 1, self.views[0].sequence
+        for view in (view for view in self.views if view.sequence == number):
             links: list[Tensor] = []
             for _, bound in self._bound("image", view):
                 # Terms on the same nodes share them.
@@ -353,31 +354,62 @@ class TrackingCost:
         return max(1, min(CHUNK, CHUNK_NODES // nodes) * more)
 
     def _evaluated(
-        self, evaluate: Callable[[_Part], dict[str, Tensor]], x: States, at: States | None = None
+        self,
+        evaluate: Callable[[_Part], dict[str, Tensor]],
+        x: States,
+        at: States | None = None,
+        *,
+        apart: bool = False,
     ) -> dict[str, Tensor]:
-        """Evaluate sequence by sequence, a chunk at a time, and put the results together."""
+        """Evaluate what can be at a time, and put the results together; see `_shares`."""
         flat, found, order = x.detach().reshape(-1, x.shape[-1]), [], []
         moved = flat if at is None else at.detach().reshape(flat.shape)
         component = self.parent if self.component is None else self.component
-        for past in self.past:
-            items = torch.arange(len(flat), device=x.device)
-            if self.sequence is not None:
-                items = items[self.sequence == past.sequence]
-            if not len(items) and (found or len(flat)):
-                continue
-            views = [view for view in self.views if view.sequence == past.sequence]
-            for some in items.split(self._chunk):
-                of = (None if each is None else each[some] for each in (self.parent, component))
-                states = flat[some], moved[some]
-                found.append(evaluate(_Part(self, past.body, past, views, *states, *of)))
-                order.append(some)
+        for cost, past, views, some in self._shares(len(flat), x.device, apart=apart):
+            of = (None if each is None else each[some] for each in (self.parent, component))
+            states = flat[some], moved[some]
+            part = evaluate(_Part(cost, past.body, past, views, *states, *of))
+            if some.dim() > 1:
+                part = {name: result.flatten(0, 1) for name, result in part.items()}
+            found.append(part)
+            order.append(some.flatten())
         names = dict.fromkeys(name for part in found for name in part)
         results = {name: _joined(name, found, order) for name in names}
         if len(self.past) > 1:
-            places = torch.cat(order).argsort()
-            results = {name: result[places] for name, result in results.items()}
+            places = torch.cat(order)
+            results = {
+                name: result.new_empty(len(flat), *result.shape[1:]).index_copy(0, places, result)
+                for name, result in results.items()
+            }
         shape = x.shape[:-1]
         return {n: result.reshape((*shape, *result.shape[1:])) for n, result in results.items()}
+
+    def _shares(
+        self, count: int, device: torch.device, *, apart: bool
+    ) -> Iterator[tuple[TrackingCost, FrameContext, Sequence[FrameContext], Tensor]]:
+        """Which of so many samples are evaluated at once, with which cost, past and views.
+
+        Few samples of sequences that are alike are all evaluated at once: `[S b]`, those of some
+        repeated. Others, or all if they are to be taken `apart`, are sequence by sequence and a
+        chunk at a time: many samples hide the overhead of calls anyway.
+        """
+        if self.sequence is not None and len(self.past) > 1 and not apart:
+            rows = rows_of(self.sequence, [past.sequence for past in self.past], self._chunk)
+            whole = None if rows is None else merged(self)
+            if rows is not None and whole is not None:
+                yield whole, whole.past[0], whole.views, rows
+                return
+        any_yet = False
+        for past in self.past:
+            items = torch.arange(count, device=device)
+            if self.sequence is not None:
+                items = items[self.sequence == past.sequence]
+            if not len(items) and (any_yet or count):
+                continue
+            any_yet = True
+            views = [view for view in self.views if view.sequence == past.sequence]
+            for some in items.split(self._chunk):
+                yield self, past, views, some
 
     def _says(self, kind: Kind) -> bool:
         """Whether a view says something to a term of a kind."""
@@ -444,7 +476,7 @@ class _Part:
     def value(self) -> Float[Tensor, " b"]:
         """Cost of the samples."""
         values = list(self.values().values())
-        return torch.stack(values).sum(0) if values else self.x.new_zeros(len(self.x))
+        return torch.stack(values).sum(0) if values else self.x.new_zeros(self.x.shape[:-1])
 
     def gradients(self) -> dict[str, Tensor]:
         """Gradient of every prior and term."""
@@ -473,7 +505,7 @@ class _Part:
         cost, x, curvature = self.cost, self.x, self.cost.choice.curvature
         if curvature is Curvature.AUTOGRAD:
             return self._by_autograd()
-        pose, points, links, costs = self._pose(), [], [], []
+        pose, points, links, costs, axis = self._pose(), [], [], [], x.dim() - 1
         for name, scale, term, posed in self._terms(pose):
             with cost.timed(name):
                 part = term.point_cost(posed, gauss_newton=curvature is Curvature.GAUSS_NEWTON)
@@ -482,12 +514,12 @@ class _Part:
                 costs.append([scale * field for field in part])
         size = x.shape[-1]
         total = LocalModel(
-            x.new_zeros(len(x)), torch.zeros_like(x), x.new_zeros(len(x), size, size)
+            x.new_zeros(x.shape[:-1]), torch.zeros_like(x), x.new_zeros(*x.shape, size)
         )
         if points:
             with cost.timed("lift"):
-                every = PointCost(*(torch.cat(parts, dim=1) for parts in zip(*costs, strict=True)))
-                where, link = torch.cat(points, dim=1), torch.cat(links)
+                every = PointCost(*(torch.cat(parts, axis) for parts in zip(*costs, strict=True)))
+                where, link = torch.cat(points, axis), torch.cat(links)
                 total = self.body.lift(pose, where, link, every, curvature=curvature)
         for name, weight, prior, posed in self._bound("prior", pose):
             with cost.timed(name):

@@ -32,6 +32,7 @@ nodes.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from itertools import compress
 from typing import NamedTuple
@@ -205,7 +206,7 @@ class ContourPredictor(nn.Module):
         normals = (normals @ turn).flatten(-3, -2)
         exists, rays = exists.flatten(-2), points - centre_world
         # Past the others to the nodes; and past the neighbours beside them and on behind them.
-        reach = BEHIND * body.part_shape.to(rays)[:, :2].mean(-1)
+        reach = BEHIND * body.part_shape.to(rays)[..., :2].mean(-1)
         beside = torch.arange(2, dtype=reach.dtype, device=reach.device)
         visible, free = line_of_sight(
             body.part_shape,
@@ -213,7 +214,7 @@ class ContourPredictor(nn.Module):
             eye,
             torch.cat([rays, rays + CLEARANCE * normals], dim=-2),
             torch.cat([self.other, self.touching]) > 0,
-            behind=torch.outer(beside.repeat_interleave(self.num_nodes), reach),
+            behind=beside.repeat_interleave(self.num_nodes)[:, None] * reach[..., None, :],
             wanted=torch.cat([exists, exists], dim=-1),
         ).chunk(2, dim=-1)
         return SeenNodes(points, normals, exists * free, visible)
@@ -328,12 +329,13 @@ def line_of_sight(
     if others.numel() == 0:
         return eye.new_ones(rays.shape[:-1])
     parts = _known_parts(shape, eye)
-    views = _Views.of(rotation, eye, rays)
+    views = _Views.of(rotation, eye, rays, len(parts.radius))
     if wanted is not None:  # what is not wanted ends before it begins
         wanted = wanted.reshape(views.length.shape)
         views = views._replace(length=torch.where(wanted > 0, views.length, -torch.inf))
     behind = torch.zeros_like(others, dtype=eye.dtype) if behind is None else behind
-    gaps = _sight_gaps(parts, views, others.T, behind.to(eye).T.contiguous())
+    behind = behind.to(eye).mT.expand(*shape.shape[:-2], *([-1] * 2)).reshape(-1, *others.T.shape)
+    gaps = _sight_gaps(parts, views, others.T, behind.contiguous())
     return (0.5 + gaps.reshape(rays.shape[:-1]) / RAMP).clamp(0, 1)
 
 
@@ -345,23 +347,35 @@ class _Views(NamedTuple):
         centre: Centre of each part from the camera's, world axes, metres.
         direction: Unit directions of the lines, world axes.
         length: Distance of the nodes, metres.
+        body: Which of several bodies each pose is of; None: there is one.
     """
 
     frames: Float[Tensor, "b parts 12"]
     centre: Float[Tensor, "b parts 3"]
     direction: Float[Tensor, "b 3 p"]
     length: Float[Tensor, "b p"]
+    body: Int[Tensor, " b"] | None = None
 
     @classmethod
-    def of(cls, rotation: Tensor, eye: Tensor, rays: Tensor) -> _Views:
+    def of(cls, rotation: Tensor, eye: Tensor, rays: Tensor, rows: int) -> _Views:
         """From the parts' orientations, the camera in their frames, and rays to the nodes."""
+        bodies = torch.arange(rows // rotation.shape[-3], device=eye.device)
         rotation = rotation.reshape(-1, *rotation.shape[-3:])
+        body = bodies.repeat_interleave(len(rotation) // len(bodies)) if len(bodies) > 1 else None
         eye = eye.clamp(-_FAR, _FAR).reshape(rotation.shape[:-1])
         centre = -(rotation @ eye[..., None])[..., 0]
         frames = torch.cat([rotation.flatten(-2), eye], dim=-1)
         rays = rays.clamp(-_FAR, _FAR).reshape(-1, *rays.shape[-2:]).mT.contiguous()
         length = rays.square().sum(1).sqrt()
-        return cls(frames, centre, rays / length.clamp(min=_TINY)[:, None], length)
+        return cls(frames, centre, rays / length.clamp(min=_TINY)[:, None], length, body)
+
+    def take(self, some: slice) -> _Views:
+        """Some of the poses."""
+        return _Views(*(None if part is None else part[some] for part in self))  # type: ignore[arg-type]
+
+    def own(self, rows: Float[Tensor, "bodies *rest"]) -> Float[Tensor, "#b *rest"]:
+        """What each pose's body has."""
+        return rows if self.body is None else rows[self.body]
 
 
 class _Parts(NamedTuple):
@@ -409,6 +423,7 @@ def _known_parts(shape: Float[Tensor, "parts 9"], like: Tensor) -> _Parts:
 
 def tabulate_parts(shape: Float[Tensor, "parts 9"]) -> _Parts:
     """The shapes of all parts; outside `radius` and `around` the width of the ramp is left free."""
+    shape = shape.reshape(-1, 9)  # of several bodies one after the other
     axes, exponents = shape[:, :3], shape[:, 3:5].clamp(*EXPONENTS)
     e1, e2 = exponents.unbind(-1)
     rows = Superquadrics.of(shape)
@@ -440,7 +455,10 @@ def _farthest(a: Tensor, b: Tensor, exponent: Tensor) -> Tensor:
 
 
 def _sight_gaps(
-    parts: _Parts, views: _Views, others: Bool[Tensor, "parts p"], behind: Float[Tensor, "parts p"]
+    parts: _Parts,
+    views: _Views,
+    others: Bool[Tensor, "parts p"],
+    behind: Float[Tensor, "bodies parts p"],
 ) -> Float[Tensor, "b p"]:
     """Signed distance of each line of sight to the nearest of the others, metres.
 
@@ -451,12 +469,12 @@ def _sight_gaps(
     at_once = _PAIRS_AT_ONCE if gap.device.type == "cpu" else 2**6 * _PAIRS_AT_ONCE
     poses = max(1, at_once // others.numel())
     for plain in parts.kinds:
-        candidates = others & (parts.plain == plain)[:, None]
-        reach = torch.where(candidates, parts.radius[:, None] + behind, -torch.inf)
+        radius, is_kind = (p.view(-1, len(others), 1) for p in (parts.radius, parts.plain == plain))
+        reach = torch.where(others & is_kind, radius + behind, -torch.inf)
         for first in range(0, len(gap), poses):
             chunk = slice(first, first + poses)
-            some = _Views(*(part[chunk] for part in views))
-            near = places(_is_near(parts, some, reach))
+            some = views.take(chunk)
+            near = places(_is_near(some, some.own(radius), some.own(reach)))
             if len(near):
                 lines = _stretches(parts, some, near, behind)
                 least = _least_gap(parts, lines, gap[chunk].numel(), plain=plain)
@@ -465,12 +483,12 @@ def _sight_gaps(
 
 
 def _is_near(
-    parts: _Parts, views: _Views, reach: Float[Tensor, "parts p"]
+    views: _Views, radius: Float[Tensor, "#b parts 1"], reach: Float[Tensor, "#b parts p"]
 ) -> Bool[Tensor, "b parts p"]:
     """Which rays meet a part's sphere before their end."""
     depth = views.centre @ views.direction
     # Beyond the length of a tangent to the sphere; any ray where the camera is inside it.
-    tangent = (1 - _ROUNDING) * views.centre.square().sum(-1) - parts.radius.square()
+    tangent = (1 - _ROUNDING) * views.centre.square().sum(-1) - radius[..., 0].square()
     tangent = torch.where(tangent > 0, tangent.clamp(min=0).sqrt(), -torch.inf)
     return (depth > tangent[:, :, None]) & (depth < views.length[:, None] + reach)
 
@@ -536,14 +554,16 @@ def _least_gap(parts: _Parts, lines: _Stretches, count: int, *, plain: bool) -> 
 
 
 def _stretches(
-    parts: _Parts, views: _Views, near: Int[Tensor, " m"], behind: Float[Tensor, "parts p"]
+    parts: _Parts, views: _Views, near: Int[Tensor, " m"], behind: Float[Tensor, "bodies parts p"]
 ) -> _Stretches:
     """Lines of sight in the frames of parts, from the camera to `behind` the rays' ends."""
-    num_parts, nodes = behind.shape
+    num_parts, nodes = behind.shape[1:]
     owner = near // nodes  # of all parts of all poses
     pose = owner // num_parts
     node, part = near - owner * nodes, owner - pose * num_parts
     ray = pose * nodes + node
+    if views.body is not None:
+        part = part + num_parts * views.body.index_select(0, pose)
     u, v, w = (a.flatten().index_select(0, ray) for a in views.direction.unbind(1))
     frame = views.frames.flatten(0, 1).T.index_select(1, owner)
     ux, uy, uz, vx, vy, vz, wx, wy, wz, ox, oy, oz = frame.unbind(0)
@@ -680,9 +700,9 @@ def _crossings(
     Returns:
         Points `[*batch parts 2*c 3]`, normals, and whether they exist `[*batch parts 2*c]`.
     """
-    parts, count, size, _ = curves.shape
-    points, normals = curves[..., :3].flatten(1, 2), curves[..., 3:6].flatten(1, 2)
-    towards = torch.einsum("...pi,pki->...pk", eye, normals)
+    *parts, count, size, _ = curves.shape
+    points, normals = curves[..., :3].flatten(-3, -2), curves[..., 3:6].flatten(-3, -2)
+    towards = torch.einsum("...pi,...pki->...pk", eye, normals)
     facing = (towards - (normals * points).sum(-1)).unflatten(-1, (count, size))
     away = facing < 0
     before, after = away[..., :-1], away[..., 1:]
@@ -706,9 +726,10 @@ def _crossings(
     change = here - there
     t = torch.where(change != 0, here / torch.where(change != 0, change, 1), 0.5).clamp(0, 1)
     t = t[..., None]
-    place = place + torch.arange(parts, device=eye.device)[:, None] * (count * size)
+    row = torch.arange(math.prod(parts), device=eye.device).reshape(*parts, 1)
+    place = place + row * (count * size)
     here, there = (
-        curves.flatten(0, 2).index_select(0, index.flatten()).unflatten(0, place.shape)
+        curves.flatten(0, -2).index_select(0, index.flatten()).unflatten(0, place.shape)
         for index in (place, place + 1)
     )
     mixed = torch.lerp(here[..., :6], there[..., :6], t)

@@ -8,8 +8,8 @@ Every sequence has a session of its own, with its own body, cameras, base and ge
 each is searched in a thread of its own; whoever wants samples evaluated waits until all others do,
 and the samples of those with the same terms then are one batch, each with the index of its
 sequence. No sample influences another, so that the results are those of one after the other: with
-the fused engine bit for bit. Within a batch sequences are worked off one after the other, as
-`TrackingCost` has it, so that none shares the cost of a call with another.
+the fused engine bit for bit. The eager engine, that of a GPU, evaluates sequences that are alike as
+one (`torchcss.cost.batched`), so that a call costs all of them as much as one.
 """
 
 from __future__ import annotations

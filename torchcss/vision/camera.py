@@ -49,7 +49,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchcss.errors import CameraError, check_floating, check_shape
@@ -256,7 +256,38 @@ class Camera(nn.Module):
     @property
     def centre_world(self) -> Float[Tensor, " 3"]:
         """The centre of projection in the world frame, metres."""
-        return -self.R_camera_world.mT @ self.t_camera_world
+        rotation, translation = self.R_camera_world, self.t_camera_world
+        if rotation.dim() == 2:
+            return -rotation.mT @ translation
+        return -(rotation * translation[:, None]).sum(0).movedim(0, -1)
+
+    # Several cameras as one.
+
+    @classmethod
+    def together(cls, each: Sequence[Camera]) -> Camera:
+        """Cameras of one image size, each of as many points: `[S b p 3]` or rows of these.
+
+        The numbers of cameras have the axes of points `[S 1 1]` behind their own.
+        """
+        cameras = copy(each[0])
+        cameras._buffers = {
+            name: torch.stack([camera.get_buffer(name) for camera in each], -1)[..., None, None]
+            for name in each[0]._buffers
+        }
+        cameras.has_distortion = any(camera.has_distortion for camera in each)
+        return cameras
+
+    def of_rows(self, row: Int[Tensor, " k"], size: int) -> Camera:
+        """The camera of some of so many points: itself, but for several cameras."""
+        if self.K.dim() == 2:
+            return self
+        number = row // (size // self.K.shape[2])
+        rows = copy(self)
+        rows._buffers = {
+            name: self.get_buffer(name).flatten(-3).index_select(-1, number)
+            for name in self._buffers
+        }
+        return rows
 
     # From the world to the image.
 
@@ -281,7 +312,7 @@ class Camera(nn.Module):
         """Return the points in the camera's frame, `R x + t`, metres."""
         check_shape("points_world", points_world, 3)
         check_floating("points_world", points_world)
-        translation = self.t_camera_world.to(points_world)
+        translation = self.t_camera_world.to(points_world).movedim(0, -1)
         return _turned(self.R_camera_world, points_world) + translation
 
     def project(self, points_world: Points) -> Projection:
@@ -364,10 +395,10 @@ class Camera(nn.Module):
         # Whole components, one after the other in memory: what the lift reads fastest.
         gradient = torch.stack([w * f_a, w * f_b, -w * z]).movedim(0, -1)
         rows = torch.stack([f_aa, f_ab, f_bb, -x, -y, zz]) * w.square()
-        hessian = _congruence(self.R_camera_world.to(a)).mT @ rows.flatten(1)
+        hessian = _combined(_congruence(self.R_camera_world.to(a)), rows)
         return PointCost(
             value,
-            _turned(self.R_camera_world.mT, gradient),
+            _turned(self.R_camera_world.transpose(0, 1), gradient),
             hessian.reshape(3, 3, *a.shape).movedim((0, 1), (-2, -1)),
         )
 
@@ -590,8 +621,8 @@ class Camera(nn.Module):
         return a, b, inverse_depth, depth, valid
 
     def _focal(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        focal_u, focal_v = torch.diagonal(self.K)[:2].to(like).unbind()
-        return focal_u, focal_v
+        K = self.K.to(like)
+        return K[0, 0], K[1, 1]
 
     def _to_pixels(self, a: Tensor, b: Tensor, valid: Tensor) -> ImagePoints:
         K = self.K.to(a)
@@ -609,8 +640,20 @@ def _see_distortion(camera: Camera, _keys: object) -> None:
 def _turned(rotation: Tensor, vectors: Vectors) -> Vectors:
     """Turn vectors. In memory each component of the result is one block, fast to work on."""
     components = vectors.movedim(-1, 0)
-    turned = rotation.to(vectors) @ components.reshape(3, vectors.shape[:-1].numel())
+    turned = _combined(rotation.to(vectors).transpose(0, 1), components)
     return turned.reshape(components.shape).movedim(0, -1)
+
+
+def _combined(
+    weights: Float[Tensor, "r c *#each"], rows: Float[Tensor, "r *each"]
+) -> Float[Tensor, "c *each"]:
+    """Sums of rows of numbers, by the same weights or by those of each."""
+    if weights.dim() == 2:
+        return weights.mT @ rows.reshape(len(rows), rows.shape[1:].numel())
+    total = weights[0] * rows[0]
+    for weight, row in zip(weights[1:], rows[1:], strict=True):
+        total = torch.addcmul(total, weight, row)
+    return total
 
 
 class _Lens(NamedTuple):
@@ -692,7 +735,8 @@ def _congruence(rotation: Matrix) -> Float[Tensor, "6 9"]:
     i, j = (0, 0, 1, 0, 1, 2), (0, 1, 1, 2, 2, 2)
     outer = rotation[i, :, None] * rotation[j, None, :]
     once = torch.eye(3, dtype=torch.bool, device=rotation.device)[i, j]
-    return torch.where(once[:, None, None], outer, outer + outer.mT).flatten(1)
+    once = once.reshape(-1, *[1] * (outer.dim() - 1))
+    return torch.where(once, outer, outer + outer.transpose(1, 2)).flatten(1, 2)
 
 
 def _within_radius(point: Pixels, limit: Tensor) -> Pixels:
