@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from operator import is_
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -34,8 +35,21 @@ from torchcss.vision.spline import SplineField
 if TYPE_CHECKING:
     from torchcss.cost.total import TrackingCost
 
-_FOUND: deque[tuple[tuple[object, ...], TrackingCost]] = deque(maxlen=4)
-"""The last that were made, and of what: a search evaluates the same sequences many times."""
+
+class Merged:
+    """What stands for several sequences, the last few: a search evaluates the same ones often."""
+
+    def __init__(self) -> None:
+        self._known: deque[tuple[tuple[object, ...], TrackingCost | None]] = deque(maxlen=4)
+
+    def of(self, cost: TrackingCost) -> TrackingCost | None:
+        """See `merged`."""
+        parts = (cost.choice, *cost.past, None, *cost.views)
+        for known, found in tuple(self._known):
+            if len(known) == len(parts) and all(map(is_, known, parts)):
+                return found
+        self._known.append((parts, merged(cost)))
+        return self._known[-1][1]
 
 
 def merged(cost: TrackingCost) -> TrackingCost | None:
@@ -43,10 +57,6 @@ def merged(cost: TrackingCost) -> TrackingCost | None:
 
     Weight-only terms are left out.
     """
-    parts = (cost.choice, *cost.past, None, *cost.views)
-    for known, found in tuple(_FOUND):
-        if len(known) == len(parts) and all(map(_is, known, parts)):
-            return found
     views = [[v for v in cost.views if v.sequence == past.sequence] for past in cost.past]
     kinds = [_kind(cost, *pair) for pair in zip(cost.past, views, strict=True)]
     if None in kinds or any(kind != kinds[0] for kind in kinds):
@@ -66,9 +76,7 @@ def merged(cost: TrackingCost) -> TrackingCost | None:
                 bound[term, context] = term.prepare(replace(context, camera=each[0].camera))
             else:
                 bound[term, context] = _EachPrior(own, each)
-    whole = replace(cost, views=tuple(by_camera), past=(past,), bound=bound, sequence=None)
-    _FOUND.append((parts, whole))
-    return whole
+    return replace(cost, views=tuple(by_camera), past=(past,), bound=bound, sequence=None)
 
 
 def rows_of(
@@ -92,10 +100,6 @@ def rows_of(
     sort = own.int().argmax(0).argsort(stable=True)
     place = torch.arange(largest, device=sequence.device).minimum(counts[:, None] - 1)
     return sort[counts.cumsum(0)[:, None] - counts[:, None] + place]
-
-
-def _is(one: object, other: object) -> bool:
-    return one is other
 
 
 def _kind(cost: TrackingCost, past: FrameContext, views: Sequence[FrameContext]) -> Any:

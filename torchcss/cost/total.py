@@ -47,7 +47,7 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 
 from torchcss.body.model import BodyModel, BodyPose
-from torchcss.cost.batched import merged, rows_of
+from torchcss.cost.batched import Merged, merged, rows_of
 from torchcss.cost.choice import CostChoice
 from torchcss.cost.context import BodyTables, FrameContext
 from torchcss.cost.term import BoundImage, Kind, Posed, Term, differentiate_twice
@@ -104,6 +104,7 @@ class TrackingCost:
         stopwatch: Where the time of the evaluations is added up by term; None: not at all.
         engine: What evaluates it; None: the terms as they are written.
         bound: The terms bound to the views; what is not among them is bound now.
+        merged: Where what stands for several sequences is kept for the next call; None: nowhere.
     """
 
     choice: CostChoice
@@ -115,6 +116,7 @@ class TrackingCost:
     stopwatch: Stopwatch | None = None
     engine: Engine | None = None
     bound: Mapping[tuple[Term, FrameContext], Any] = field(default_factory=dict, repr=False)
+    merged: Merged | None = None
 
     def __post_init__(self) -> None:
         if not self.past:
@@ -395,8 +397,8 @@ class TrackingCost:
         """
         if self.sequence is not None and len(self.past) > 1 and not apart:
             rows = rows_of(self.sequence, [past.sequence for past in self.past], self._chunk)
-            whole = None if rows is None else merged(self)
-            if rows is not None and whole is not None:
+            merge = merged if self.merged is None else self.merged.of
+            if rows is not None and (whole := merge(self)) is not None:
                 yield whole, whole.past[0], whole.views, rows
                 return
         any_yet = False
@@ -588,13 +590,16 @@ def beside(costs: Iterable[TrackingCost]) -> TrackingCost:
     return replace(costs[0], views=views, bound=bound)
 
 
-def together(costs: Sequence[TrackingCost], sequence: Indices) -> TrackingCost:
+def together(
+    costs: Sequence[TrackingCost], sequence: Indices, merged: Merged | None = None
+) -> TrackingCost:
     """The cost of samples of several sequences, with bodies, cameras and pictures of their own.
 
     Args:
         costs: The cost of each sequence, numbered (`numbered`) in rising order, with the same
             choice of terms; of their samples, those of each keep their order.
         sequence: The number of the sequence that each sample belongs to.
+        merged: See `TrackingCost.merged`.
     """
     parent, component = torch.zeros_like(sequence), torch.zeros_like(sequence)
     for cost in costs:
@@ -603,7 +608,8 @@ def together(costs: Sequence[TrackingCost], sequence: Indices) -> TrackingCost:
             parent[own] = cost.parent
             component[own] = cost.parent if cost.component is None else cost.component
     past = tuple(past for cost in costs for past in cost.past)
-    return replace(beside(costs), past=past, parent=parent, component=component, sequence=sequence)
+    known = {"parent": parent, "component": component, "sequence": sequence, "merged": merged}
+    return replace(beside(costs), past=past, **known)
 
 
 def numbered(cost: TrackingCost, number: int) -> TrackingCost:

@@ -25,6 +25,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchcss.cost.batched import Merged
 from torchcss.cost.total import Engine, TrackingCost, numbered, together
 from torchcss.errors import ConfigurationError
 from torchcss.tracking.session import Images, Posterior, TrackingSession
@@ -135,11 +136,13 @@ class _Collector:
         size: Searches that have not ended.
         requests: What those want that wait.
         turn: Guards both; on a CPU a search holds it whenever it does not wait.
+        merged: What stands for several of the sequences.
     """
 
     size: int
     requests: list[_Request] = field(default_factory=list)
     turn: threading.Condition = field(default_factory=threading.Condition)
+    merged: Merged = field(default_factory=Merged)
 
     def collecting(self, number: int, cost: TrackingCost) -> TrackingCost:
         """The cost of one sequence, whose evaluations wait for those of the others."""
@@ -170,7 +173,7 @@ class _Collector:
             alike = [request for request in left if _is_alike(request, left[0])]
             left = [request for request in left if request not in alike]
             try:
-                _answer(alike)
+                _answer(alike, self.merged)
             except Exception as error:
                 for request in alike:
                     request.answer = error
@@ -214,7 +217,7 @@ def _is_alike(one: _Request, other: _Request) -> bool:
     return same and batches and x.dtype == y.dtype and x.device == y.device
 
 
-def _answer(requests: Sequence[_Request]) -> None:
+def _answer(requests: Sequence[_Request], merged: Merged) -> None:
     """Evaluate in one call; each gets its share."""
     sizes = [request.x.shape[:-1].numel() for request in requests]
     if len(requests) == 1:
@@ -224,7 +227,8 @@ def _answer(requests: Sequence[_Request]) -> None:
     x = torch.cat([request.x for request in requests])
     numbers = torch.tensor([request.cost.views[0].sequence for request in requests])
     sequence = numbers.repeat_interleave(torch.tensor(sizes)).to(x.device)
-    cost = replace(together([request.cost for request in requests], sequence), stopwatch=None)
+    every = together([request.cost for request in requests], sequence, merged)
+    cost = replace(every, stopwatch=None)
     if requests[0].what == "value":
         shares: Sequence[Any] = cost.value(x).split(sizes)
     else:
