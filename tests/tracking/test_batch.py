@@ -114,9 +114,9 @@ def sizes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     found: list[int] = []
     answer: Callable[..., None] = batch._answer
 
-    def counted(asks: Any) -> None:
+    def counted(asks: Any, *more: Any) -> None:
         found.append(len(asks))
-        answer(asks)
+        answer(asks, *more)
 
     monkeypatch.setattr(batch, "_answer", counted)
     return found

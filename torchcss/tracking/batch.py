@@ -9,7 +9,8 @@ each is searched in a thread of its own; whoever wants samples evaluated waits u
 and the samples of those with the same terms then are one batch, each with the index of its
 sequence. No sample influences another, so that the results are those of one after the other: with
 the fused engine bit for bit. The eager engine, that of a GPU, evaluates sequences that are alike as
-one (`torchcss.cost.batched`), so that a call costs all of them as much as one.
+one (`torchcss.cost.batched`), so that few samples of all cost as many calls as those of one; the
+fused engine shares the samples of all out among its threads.
 """
 
 from __future__ import annotations
