@@ -103,6 +103,12 @@ class Proposal(ABC):
         return self
 
 
+def unbounded(like: Vectors) -> Bounds:
+    """No limits on states like these."""
+    limit = torch.full_like(like.reshape(-1, like.shape[-1])[0], math.inf)
+    return Bounds(-limit, limit)
+
+
 _STATES_AT_ONCE = 1024
 """Samples whose covariances are held in memory together."""
 

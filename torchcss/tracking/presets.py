@@ -44,8 +44,6 @@ from dataclasses import field, replace
 from types import MappingProxyType
 from typing import Literal
 
-import torch
-
 from torchcss.errors import ConfigurationError
 from torchcss.inference.particle import AnnealedParticleFilter, ParticleFilter
 from torchcss.inference.proposals import (
@@ -56,6 +54,7 @@ from torchcss.inference.proposals import (
     HeavyTailed,
     Proposal,
     Spherical,
+    unbounded,
 )
 from torchcss.inference.trust_region import TrustRegionNewton
 from torchcss.types import Bounds, Curvature, frozen
@@ -165,8 +164,7 @@ class Preset:
         """
         if self.limits:
             return limits
-        infinite = torch.full_like(limits.lower, math.inf)
-        return Bounds(-infinite, infinite)
+        return unbounded(limits.lower)
 
 
 PARTS_OF_A_PERSON = 18
