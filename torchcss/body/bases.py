@@ -12,6 +12,7 @@ from torch import Tensor
 from torchcss.body.kinematics import TreePose
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.linalg import multiply
+from torchcss.types import Vectors
 
 
 def on_origin(body: BodyModel) -> BodyModel:
@@ -19,9 +20,7 @@ def on_origin(body: BodyModel) -> BodyModel:
     return body.with_base(torch.eye(3), torch.zeros(3)).to(dtype=torch.float64, device="cpu")
 
 
-def pose_track(
-    body: BodyModel, state: Float[Tensor, "*batch n"], base: Float[Tensor, "*batch 4 4"]
-) -> BodyPose:
+def pose_track(body: BodyModel, state: Vectors, base: Float[Tensor, "*batch 4 4"]) -> BodyPose:
     """Pose a body on a base of its own in every item.
 
     Args:

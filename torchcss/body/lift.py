@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchcss.body.kinematics import KinematicTree, TreePose
-from torchcss.types import LocalModel, PointCost
+from torchcss.types import LocalModel, Numbers, PointCost
 
 
 def lift_to_joints(
@@ -41,7 +41,7 @@ def lift_to_joints(
     point_link: Int[Tensor, " p"],
     cost: PointCost,
     *,
-    second_order_kinematics: bool | Float[Tensor, "*batch"] = True,
+    second_order_kinematics: bool | Numbers = True,
 ) -> LocalModel:
     """Sum a cost over points and differentiate it with respect to the joint values.
 

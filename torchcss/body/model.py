@@ -23,7 +23,7 @@ from torchcss.body.lift import lift_to_joints
 from torchcss.body.rotations import check_rotation
 from torchcss.body.surface import SurfaceSample, angular_grid, surface_points
 from torchcss.errors import BodyError, ShapeError, check_floating, check_shape
-from torchcss.types import Bounds, Curvature, LocalModel, PointCost, Vectors
+from torchcss.types import Bounds, Curvature, LocalModel, PointCost, Vector, Vectors
 
 
 class BodyPose(NamedTuple):
@@ -35,7 +35,7 @@ class BodyPose(NamedTuple):
         joints: Positions of the named joint centres, metres.
     """
 
-    x: Float[Tensor, "*batch n"]
+    x: Vectors
     tree: TreePose
     joints: Float[Tensor, "*batch j 3"]
 
@@ -179,7 +179,7 @@ class BodyModel(nn.Module):
         return self.tie.dtype
 
     @property
-    def rest(self) -> Float[Tensor, " n"]:
+    def rest(self) -> Vector:
         """The rest pose: zero, moved inside the limits."""
         return self.bounds.project(torch.zeros_like(self.lower))
 
@@ -279,7 +279,7 @@ class BodyModel(nn.Module):
         other._buffers["base_translation"] = translation.to(self.tie)
         return other
 
-    def forward_kinematics(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch l 4 4"]:
+    def forward_kinematics(self, x: Vectors) -> Float[Tensor, "*batch l 4 4"]:
         """Pose of every link in the world, by pytorch-kinematics; in the order `tree.link_names`.
 
         Args:
@@ -293,7 +293,7 @@ class BodyModel(nn.Module):
         poses = self.tree.link_poses(x @ self.tie.T.to(x) + self.offset.to(x))
         return self.base_transform.to(x) @ poses
 
-    def pose(self, x: Float[Tensor, "*batch n"]) -> BodyPose:
+    def pose(self, x: Vectors) -> BodyPose:
         """Pose the body for the evaluation of a cost: the map A of eq. 1 [IJRR].
 
         The poses are those of `forward_kinematics`; the twists say how they move.

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchcss.body.chain import offset_matrix
 from torchcss.body.model import BodyModel
 from torchcss.body.rotations import root_angles, root_rotation
-from torchcss.types import Bounds, Vectors
+from torchcss.types import Bounds, Matrices, Vector, Vectors
 
 ROOT_NAMES = ("root_x", "root_y", "root_z", "root_yaw", "root_pitch", "root_roll")
 
@@ -52,7 +52,7 @@ def free_turns(body: BodyModel) -> Bounds:
 
 
 def root_pose(
-    body: BodyModel, x: Float[Tensor, "*batch n"]
+    body: BodyModel, x: Vectors
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
     """World pose of the root link."""
     index = body.state_columns(ROOT_NAMES)
@@ -62,7 +62,7 @@ def root_pose(
 
 
 def base_without_root(
-    rooted: BodyModel, fixed: BodyModel, x: Float[Tensor, " n"]
+    rooted: BodyModel, fixed: BodyModel, x: Vector
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """Base on which a body without a root stands where it stands with one.
 
@@ -86,9 +86,9 @@ def move_base(
     body: BodyModel,
     rotation: Float[Tensor, "3 3"],
     translation: Float[Tensor, "3"],
-    x: Float[Tensor, "*batch n"],
-    covariance: Float[Tensor, "*batch n n"] | None = None,
-) -> tuple[BodyModel, Float[Tensor, "*batch n"], Float[Tensor, "*batch n n"] | None]:
+    x: Vectors,
+    covariance: Matrices | None = None,
+) -> tuple[BodyModel, Vectors, Matrices | None]:
     """Hang the body on another base without moving it.
 
     Args:

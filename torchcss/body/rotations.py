@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torchcss.errors import ConfigurationError, check_floating, check_shape
+from torchcss.types import Numbers
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -176,7 +177,7 @@ def _of_scipy(rotation: Float[np.ndarray, "*batch 3 3"]) -> Rotation:
     return Rotation.from_matrix(rotation.reshape(-1, 3, 3))
 
 
-def within_half_turn(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def within_half_turn(angle: Numbers) -> Numbers:
     """The same angles, from minus half a turn to half a turn, radians."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 

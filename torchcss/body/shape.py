@@ -34,7 +34,7 @@ from torchcss.body.catalog import without_side
 from torchcss.body.lift import wrench
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.surface import SHAPE_NAMES, straighten, surface_points
-from torchcss.types import Bounds, LocalModel, PointCost
+from torchcss.types import Bounds, LocalModel, Numbers, PointCost
 
 CROSS_SECTIONS = ("a1", "a2", "taper_x", "taper_y")
 """The volumetric numbers of the second stage: cross-sections and their tapers."""
@@ -177,7 +177,7 @@ def surface_derivatives(
 
 def surface_angles(
     shape: Float[Tensor, "*batch 9"], points: Float[Tensor, "*batch 3"]
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+) -> tuple[Numbers, Numbers]:
     """Latitude and longitude of surface points: the inverse of `surface_points`.
 
     For points off the surface they are those of a point of the surface nearby.

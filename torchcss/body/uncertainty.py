@@ -24,6 +24,7 @@ from torch import Tensor
 from torchcss.body.kinematics import TreePose
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.errors import check_shape
+from torchcss.types import Matrices
 
 
 class Held(NamedTuple):
@@ -79,7 +80,7 @@ def point_jacobian(
 def joint_covariance(
     body: BodyModel,
     pose: BodyPose,
-    covariance: Float[Tensor, "*batch n n"],
+    covariance: Matrices,
     *,
     about: Sequence[int] = (),
     held: Held | None = None,

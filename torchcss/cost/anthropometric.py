@@ -42,7 +42,7 @@ from torchcss.body.catalog import PLACES, PROPORTIONS, without_side
 from torchcss.body.model import BodyModel
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
-from torchcss.types import LocalModel, frozen
+from torchcss.types import LocalModel, Vectors, frozen
 
 INDIVIDUAL: dict[str, float] = {
     "hip_width": 0.050,
@@ -101,7 +101,7 @@ class Anthropometric(Term):
         common, own = self._deviations(body)
         return common[:, None] * common + torch.diag(own.square())
 
-    def local_model(self, x: Float[Tensor, "*batch n"], body: BodyModel) -> LocalModel:
+    def local_model(self, x: Vectors, body: BodyModel) -> LocalModel:
         """Cost, gradient and (constant) Hessian; zero for a body without free lengths.
 
         Args:

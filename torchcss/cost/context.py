@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchcss.body.model import BodyModel
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.types import Keypoints
+from torchcss.types import Keypoints, Vector
 from torchcss.vision.appearance import Appearance
 from torchcss.vision.background import Background
 from torchcss.vision.camera import Camera
@@ -116,7 +116,7 @@ class FrameContext:
     background: Background | None = None
     modes: Float[Tensor, "k n"] | None = None
     prior: GaussianMixture | None = None
-    deviation: Float[Tensor, " n"] | None = None
+    deviation: Vector | None = None
     sequence: int = 0
 
     def __post_init__(self) -> None:

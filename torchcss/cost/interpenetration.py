@@ -56,7 +56,7 @@ from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.errors import ConfigurationError
-from torchcss.types import Curvature, LocalModel, PointCost, frozen
+from torchcss.types import Curvature, LocalModel, Numbers, PointCost, frozen
 
 END = 6.0
 """The `c` above: the potential ends where that of the paper has fallen to `exp(-c)`."""
@@ -361,9 +361,7 @@ class Interpenetration(Term):
         """The R at which the potential ends."""
         return (1 + END ** (1 / self.p) / self.sharpness) ** 0.5
 
-    def value(
-        self, body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs
-    ) -> Float[Tensor, "*batch"]:
+    def value(self, body: BodyModel, pose: BodyPose, pairs: InterpenetrationPairs) -> Numbers:
         """Cost in nats.
 
         Args:

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchcss.body.model import BodyModel
+from torchcss.types import Vectors
 from torchcss.vision.camera import Camera
 from torchcss.vision.rasterise import grid_faces, nearest_faces
 
@@ -30,7 +31,7 @@ ruled out would hide the background from the one that is right."""
 
 def part_map(
     body: BodyModel,
-    state: Float[Tensor, "*batch n"],
+    state: Vectors,
     camera: Camera,
     *,
     rings: int = 12,

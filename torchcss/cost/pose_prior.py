@@ -42,7 +42,7 @@ from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.uncertainty import point_jacobian
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
-from torchcss.types import LocalModel, frozen
+from torchcss.types import LocalModel, Numbers, frozen
 from torchcss.vision.camera import Upright
 
 Each = Float[Tensor, " k"]
@@ -329,7 +329,7 @@ class Density(NamedTuple):
         tail = exponent.new_full((*exponent.shape[:-1], 1), self.uniform)
         return torch.cat([exponent, tail], dim=-1), pull
 
-    def cost(self, directions: LimbDirections) -> Float[Tensor, "*batch"]:
+    def cost(self, directions: LimbDirections) -> Numbers:
         """`-log p`, nats."""
         return -self.parts(directions)[0].logsumexp(-1)
 
@@ -379,7 +379,7 @@ class BodyDensity(NamedTuple):
     which: Directions
     densities: dict[str, Density]
 
-    def cost(self, joints: Float[Tensor, "*batch j 3"]) -> Float[Tensor, "*batch"]:
+    def cost(self, joints: Float[Tensor, "*batch j 3"]) -> Numbers:
         """`-log p` of posed bodies, nats, from their joint centres."""
         directions = limb_directions(joints, self.which)
         costs = [self.densities[group].cost(own) for group, own in directions.items()]

@@ -39,7 +39,7 @@ from torchcss.cost.outline import Derivatives, ImageNodes, OutlineTerm
 from torchcss.cost.part_map import grow, part_map
 from torchcss.cost.term import Need, OnPoints, Values
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.types import frozen
+from torchcss.types import Vector, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.sampling import gaussian_blur
 from torchcss.vision.spline import SplineField, spline_field
@@ -114,7 +114,7 @@ class RegionMasks(NamedTuple):
 
 def region_masks(
     body: BodyModel,
-    state: Float[Tensor, " n"],
+    state: Vector,
     camera: Camera,
     *,
     fitted: bool = True,

@@ -33,7 +33,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.part_map import part_map
 from torchcss.cost.region import layer_of_part
 from torchcss.cost.term import BoundWeight, Need, Term
-from torchcss.types import frozen
+from torchcss.types import Numbers, Vector, Vectors, frozen
 from torchcss.vision.camera import Camera
 from torchcss.vision.features import Window
 
@@ -104,7 +104,7 @@ class SegmentationTerm(Term):
         layer_of_part: Int[Tensor, " parts"],
         camera: Camera,
         body: BodyModel,
-        expected: Float[Tensor, " n"],
+        expected: Vector,
         *,
         window: Window | None = None,
     ) -> SegmentationImages:
@@ -132,9 +132,7 @@ class SegmentationTerm(Term):
         looks = reduced[:, top:bottom, left:right].to(body.tie).contiguous()
         return SegmentationImages(here, looks, layer, area)
 
-    def value(
-        self, body: BodyModel, x: Float[Tensor, "*batch n"], images: SegmentationImages
-    ) -> Float[Tensor, "*batch"]:
+    def value(self, body: BodyModel, x: Vectors, images: SegmentationImages) -> Numbers:
         """One, less the ratio summed over the covered pixels as a share of the body's area.
 
         Zero is a body whose every pixel looks like what it is, one is a body of which nothing is

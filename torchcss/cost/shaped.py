@@ -24,7 +24,7 @@ from torchcss.body.shape import ShapeParameters, lift_with_shape, surface_angles
 from torchcss.cost.outline import OutlineTerm
 from torchcss.cost.total import TrackingCost
 from torchcss.cost.visibility import ContourPredictor
-from torchcss.types import LocalModel, PointCost, frozen
+from torchcss.types import LocalModel, PointCost, Vector, frozen
 
 
 class Outline(NamedTuple):
@@ -83,7 +83,7 @@ class ShapedCost:
             LocalModel(*(torch.stack(field) for field in zip(*outlines, strict=True)))
         )
 
-    def _outlines(self, x: Float[Tensor, " n"], z: Float[Tensor, " z"]) -> LocalModel:
+    def _outlines(self, x: Vector, z: Float[Tensor, " z"]) -> LocalModel:
         camera, shape = self.base.camera, self.parameters.shape(z)
         body = with_shape(self.base.body, shape)
         predictor = ContourPredictor(body)

@@ -19,7 +19,7 @@ from torchcss.cost.anthropometric import proportion_columns
 from torchcss.cost.context import FrameContext
 from torchcss.cost.term import OnStates, Term
 from torchcss.robust import Lorentzian
-from torchcss.types import LocalModel, frozen
+from torchcss.types import LocalModel, Vector, Vectors, frozen
 
 _SEEN = (
     *("shoulder_swing", "shoulder_raising", "elbow_flexion"),
@@ -29,9 +29,9 @@ _SEEN = (
 
 
 def long_tailed(
-    x: Float[Tensor, "*batch n"],
+    x: Vectors,
     centre: Float[Tensor, "*#batch n"],
-    deviation: Float[Tensor, " n"],
+    deviation: Vector,
     nu: float,
 ) -> LocalModel:
     """Sum over parameters of the Lorentzian prior about `centre`; its Hessian is diagonal.
@@ -74,7 +74,7 @@ class Stabiliser(Term):
         mean, deviation = context.body.sticky_mean, self.deviation(context.body)
         return OnStates(lambda posed, _: long_tailed(posed.x, mean, deviation, self.nu))
 
-    def deviation(self, body: BodyModel) -> Float[Tensor, " n"]:
+    def deviation(self, body: BodyModel) -> Vector:
         """Standard deviations of a body's parameters; infinite where free."""
         deviation, free = body.sticky_deviation.clone(), []
         if not self.lengths:

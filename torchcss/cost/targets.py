@@ -25,7 +25,7 @@ from torchcss.cost.interpenetration import Interpenetration, InterpenetrationPai
 from torchcss.cost.stabiliser import Stabiliser, long_tailed
 from torchcss.errors import ShapeError, check_shape
 from torchcss.kernels import compiler
-from torchcss.types import CostFunction, LocalModel, PointCost, frozen
+from torchcss.types import CostFunction, LocalModel, Numbers, PointCost, Vector, Vectors, frozen
 
 States = Float[Tensor, "*batch m"]
 
@@ -60,7 +60,7 @@ class PointTargets:
     target: Float[Tensor, "*#batch p 3"]
     sigma: Float[Tensor, " p"]
     columns: Int[Tensor, " m"] | None = None
-    held: Float[Tensor, " n"] | None = None
+    held: Vector | None = None
     sticky: bool = True
     repulsion: Interpenetration | None = None
     pairs: InterpenetrationPairs | None = None
@@ -79,7 +79,7 @@ class PointTargets:
         """The cost of some items; the same where all have the same targets."""
         return self if self.target.dim() == 2 else replace(self, target=self.target[items])
 
-    def whole(self, x: States) -> Float[Tensor, "*batch n"]:
+    def whole(self, x: States) -> Vectors:
         """States of the body: x, and what is held."""
         if self.columns is None or self.held is None:
             return x
@@ -87,7 +87,7 @@ class PointTargets:
         held = self.held.expand(*x.shape[:-1], len(self.held))
         return held.index_copy(-1, self.columns, x)
 
-    def value(self, x: States) -> Float[Tensor, "*batch"]:
+    def value(self, x: States) -> Numbers:
         """Cost in nats."""
         return self.local_model(x).value
 
@@ -133,7 +133,7 @@ def pose_targets(
     pose: Float[Tensor, "4 4"] | Float[Tensor, "3"],
     *,
     columns: Int[Tensor, " m"] | None = None,
-    held: Float[Tensor, " n"] | None = None,
+    held: Vector | None = None,
     sigma: float = 0.1,
 ) -> PointTargets:
     """The cost of a link that should have a given pose.

@@ -20,7 +20,7 @@ from torchcss.cost.context import FrameContext
 from torchcss.cost.stabiliser import long_tailed
 from torchcss.cost.term import OnStates, Term
 from torchcss.inference.mixture import GaussianMixture
-from torchcss.types import LocalModel, frozen
+from torchcss.types import LocalModel, Vectors, frozen
 
 _LEAST_VARIANCE = 1e-12
 
@@ -116,7 +116,7 @@ class MixturePrior(Term):
         height = predicted.log_weight - root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return MixtureDensity(predicted.mean, torch.cholesky_inverse(root), height - height.max())
 
-    def local_model(self, x: Float[Tensor, "*batch n"], density: MixtureDensity) -> LocalModel:
+    def local_model(self, x: Vectors, density: MixtureDensity) -> LocalModel:
         """Cost, gradient and Hessian.
 
         Args:

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.cost.context import FrameContext
-from torchcss.types import Curvature, LocalModel, PointCost
+from torchcss.types import Curvature, LocalModel, Numbers, PointCost, Vectors
 from torchcss.vision.camera import Camera
 
 Kind = Literal["image", "prior", "weight-only"]
@@ -127,7 +127,7 @@ class BoundWeight(NamedTuple):
     """
 
     scale: float
-    value: Callable[[Posed], Float[Tensor, "*batch"]]
+    value: Callable[[Posed], Numbers]
 
 
 class Posed:
@@ -156,7 +156,7 @@ class Posed:
         return self.context.camera
 
     @property
-    def x(self) -> Float[Tensor, "*batch n"]:
+    def x(self) -> Vectors:
         """The states."""
         return self.pose.x
 
@@ -240,7 +240,7 @@ class OnStates:
     model: Callable[[Posed, Curvature], LocalModel]
     cost: Callable[[Posed], Tensor] | None = None
 
-    def value(self, posed: Posed) -> Float[Tensor, "*batch"]:
+    def value(self, posed: Posed) -> Numbers:
         """Cost, nats."""
         if self.cost is not None:
             return self.cost(posed)
@@ -251,7 +251,7 @@ class OnStates:
         return self.model(posed, curvature)
 
 
-def differentiate_twice(value: Float[Tensor, "*batch"], x: Float[Tensor, "*batch n"]) -> LocalModel:
+def differentiate_twice(value: Numbers, x: Vectors) -> LocalModel:
     """Gradient and Hessian of a batch of scalars by double backward, one row at a time.
 
     Args:

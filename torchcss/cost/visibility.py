@@ -45,10 +45,8 @@ from torch import Tensor, nn
 from torchcss.body.model import BodyModel, BodyPose
 from torchcss.body.superquadric import EXPONENTS, Superquadrics, radial_square
 from torchcss.body.surface import SurfaceSample, surface_points
-from torchcss.cost.term import Posed
+from torchcss.cost.term import Points, Posed, Values
 
-Vectors = Float[Tensor, "*batch p 3"]
-Values = Float[Tensor, "*batch p"]
 Place = Float[Tensor, "3"]
 
 _TINY = 1e-12
@@ -99,8 +97,8 @@ class SeenNodes(NamedTuple):
             where a node does not exist: nothing depends on it there.
     """
 
-    points: Vectors
-    normals: Vectors
+    points: Points
+    normals: Points
     exists: Values
     visible: Values
 
@@ -240,7 +238,7 @@ def visible_nodes(
     body: BodyModel,
     pose: BodyPose,
     centre_world: Place,
-    points: Vectors,
+    points: Points,
     node_part: Int[Tensor, " p"],
     *,
     wanted: Values | None = None,
@@ -263,7 +261,7 @@ def visible_nodes(
     return line_of_sight(body.part_shape, rotation, eye, rays, other, wanted=wanted)
 
 
-def facing_nodes(points: Vectors, normals: Vectors, centre_world: Place) -> SeenNodes:
+def facing_nodes(points: Points, normals: Points, centre_world: Place) -> SeenNodes:
     """Surface nodes with which of them face the camera, as if nothing were in front of them.
 
     0 where they face away, 1 where clearly towards it; the ramp between starts where the line of
@@ -285,8 +283,8 @@ def seen_nodes(
     body: BodyModel,
     pose: BodyPose,
     centre_world: Place,
-    points: Vectors,
-    normals: Vectors,
+    points: Points,
+    normals: Points,
     node_part: Int[Tensor, " p"],
 ) -> SeenNodes:
     """The same with which of them no other part hides.
@@ -309,7 +307,7 @@ def line_of_sight(
     shape: Float[Tensor, "parts 9"],
     rotation: Float[Tensor, "*batch parts 3 3"],
     eye: Float[Tensor, "*batch parts 3"],
-    rays: Vectors,
+    rays: Points,
     others: Bool[Tensor, "p parts"],
     *,
     behind: Float[Tensor, "p parts"] | None = None,

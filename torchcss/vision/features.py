@@ -33,10 +33,8 @@ from torchcss.errors import ConfigurationError, ShapeError
 from torchcss.kernels import compiler
 from torchcss.vision.boundaries import motion_boundaries
 from torchcss.vision.camera import Camera
-from torchcss.vision.edges import EdgeConfiguration, edge_features, foreground_weight
+from torchcss.vision.edges import EdgeConfiguration, Image, edge_features, foreground_weight
 from torchcss.vision.flow import FlowConfiguration, robust_flow
-
-Image = Float[Tensor, "h w"]
 
 RawImage = UInt8[Tensor, "h w"] | UInt8[Tensor, "h w c"] | Image | Float[Tensor, "h w c"]
 """A picture: grey, RGB or RGBA, 8 or 16 bits or floating point in 0..1."""

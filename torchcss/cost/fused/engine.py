@@ -21,7 +21,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from torchcss.body.model import BodyModel
@@ -46,13 +45,10 @@ from torchcss.cost.term import OnPoints
 from torchcss.cost.visibility import ContourPredictor
 from torchcss.kernels import compiler
 from torchcss.kernels.versions import version_of
-from torchcss.types import Curvature, LocalModel
+from torchcss.types import Curvature, LocalModel, Numbers, Vectors
 
 if TYPE_CHECKING:
     from torchcss.cost.total import TrackingCost
-
-States = Float[Tensor, "*batch n"]
-Costs = Float[Tensor, "*batch"]
 
 _IMAGES: dict[type[Any], tuple[str, Callable[..., Any]]] = {
     ContourTerm: ("edges", pack.pack_edges),
@@ -247,17 +243,17 @@ class FusedEngine:
         """Copied and pickled as what made it: what it has packed stays in its process."""
         return fused_engine, self._made_of
 
-    def value(self, cost: TrackingCost, x: States) -> Costs:
+    def value(self, cost: TrackingCost, x: Vectors) -> Numbers:
         """Cost in nats; see `TrackingCost.value`."""
         value, others = self._values(cost, x)
         return value if others is None else value + others.value(x)
 
-    def held_value(self, cost: TrackingCost, x: States, found_at: States) -> Costs:
+    def held_value(self, cost: TrackingCost, x: Vectors, found_at: Vectors) -> Numbers:
         """Cost in nats with what is found at other states; see `TrackingCost.held_value`."""
         value, others = self._values(cost, x, found_at)
         return value if others is None else value + others.held_value(x, found_at)
 
-    def local_model(self, cost: TrackingCost, x: States) -> LocalModel:
+    def local_model(self, cost: TrackingCost, x: Vectors) -> LocalModel:
         """Cost, gradient and Hessian; see `TrackingCost.local_model`."""
         with cost.timed("fused"):
             result, others = self._evaluate(cost, x, slopes=True)
@@ -270,8 +266,8 @@ class FusedEngine:
         return model.plus(others.local_model(x))
 
     def _values(
-        self, cost: TrackingCost, x: States, *found_at: States
-    ) -> tuple[Costs, TrackingCost | None]:
+        self, cost: TrackingCost, x: Vectors, *found_at: Vectors
+    ) -> tuple[Numbers, TrackingCost | None]:
         """Values, and the cost of what is not in them; None: nothing."""
         with cost.timed("fused"):
             result, others = self._evaluate(cost, x, *found_at, slopes=False)
@@ -487,7 +483,7 @@ def _by_sequence(cost: TrackingCost, states: Sequence[Array]) -> tuple[Array | N
 
 
 def _zeros(shape: tuple[int, ...], slopes: bool) -> Result:
-    """Costs of states of a shape to be added to, with derivatives or without."""
+    """Numbers of states of a shape to be added to, with derivatives or without."""
     size, n = shape
     width = n if slopes else 0
     return Result(np.zeros(size), np.zeros((size, width)), np.zeros((size, width, width)))
