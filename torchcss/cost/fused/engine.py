@@ -130,7 +130,7 @@ class _Packed:
     workspaces: Workspaces
     versions: dict[int, Callable[..., None]] = field(default_factory=dict)
 
-    def add(self, states: Sequence[Array], mode: Array | None, result: Result) -> None:
+    def add(self, states: Sequence[Array], mode: Array, result: Result) -> None:
         """Add the kernel's costs of some samples, each compared with a mode.
 
         Args:
@@ -143,7 +143,7 @@ class _Packed:
             kernel = self.held
         else:
             states = states[:1]
-        rows = (_rows(mode, self.modes, len(states[0])),) if self.modes else ()
+        rows = (_rows(mode, self.modes),) if self.modes else ()
         workspace = self.workspaces.take()
         arguments = *states, *rows, *self.records, workspace, result
         if len(states) not in self.versions:
@@ -163,20 +163,15 @@ class _Samples(NamedTuple):
     """
 
     states: Sequence[Array]
-    parent: Array | None
-    component: Array | None
+    parent: Array
+    component: Array
     result: Result
 
     def take(self, rows: slice) -> _Samples:
         """Some of them, in the same memory."""
-        parent, component = (
-            None if index is None else index[rows] for index in (self.parent, self.component)
-        )
-        states, result = (
-            [x[rows] for x in self.states],
-            Result(*(each[rows] for each in self.result)),
-        )
-        return _Samples(states, parent, component, result)
+        states = [x[rows] for x in self.states]
+        result = Result(*(each[rows] for each in self.result))
+        return _Samples(states, self.parent[rows], self.component[rows], result)
 
 
 class _Job(NamedTuple):
@@ -284,17 +279,15 @@ class FusedEngine:
             slopes: Whether to find derivatives.
         """
         each = [pack.array(x.reshape(-1, x.shape[-1])) for x in states]
-        order, ends = _by_sequence(cost, each)
-        parent, component = (
-            None if index is None else pack.array(index, np.int64)
-            for index in (cost.parent, cost.component)
-        )
-        component = parent if component is None else component
+        shape, (order, ends) = each[0].shape, _by_sequence(cost, each)
+        parent = component = np.zeros(len(each[0]), np.int64)
+        if cost.parent is not None:
+            parent = component = pack.array(cost.parent, np.int64)
+        if cost.component is not None:
+            component = pack.array(cost.component, np.int64)
         if order is not None:
             each = [x[order] for x in each]
-            parent, component = (
-                None if index is None else index[order] for index in (parent, component)
-            )
+            parent, component = parent[order], component[order]
         result = _zeros(each[0].shape, slopes)
         jobs: list[_Job] = []
         left_out: set[str] = set()
@@ -312,7 +305,7 @@ class FusedEngine:
             begin = end
         self._share_out(_Samples(each, parent, component, result), jobs)
         if order is not None:
-            whole = _zeros((states[0].shape[:-1].numel(), states[0].shape[-1]), slopes)
+            whole = _zeros(shape, slopes)
             for numbers, some in zip(whole, result, strict=True):
                 numbers.fill(np.nan)
                 numbers[order] = some
@@ -503,10 +496,10 @@ def _repeat_for_all_modes(records: dict[str, Any], *fields: str) -> None:
             records[name] = records[name]._replace(target=np.repeat(target, modes, 0))
 
 
-def _rows(parent: Array | None, modes: int, size: int) -> Array:
+def _rows(parent: Array, modes: int) -> Array:
     """The mode that each sample is compared with, where there are several."""
-    if parent is None or modes == 1:
-        return np.zeros(size, np.int64)
+    if modes == 1:
+        return np.zeros_like(parent)
     # Without a sign a negative one is larger than any other.
     if len(parent) and not parent.view(np.uint64).max() < modes:
         raise IndexError(f"parent: expected modes 0 to {modes - 1}, got {parent.max()}")
