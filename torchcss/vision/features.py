@@ -329,8 +329,8 @@ class FeatureExtractor(nn.Module):
         planes = picture[None] if grey else picture[..., :3].permute(2, 0, 1)
         planes = planes.to(self.luma.device)
         height, width = planes.shape[-2:]
-        new_width, new_height = self.working_shape(width, height)
-        size = None if (new_width, new_height) == (width, height) else (new_height, new_width)
+        width, height = self.working_shape(width, height)
+        size = height, width
         if picture.dtype in _WHITE:
             small = _shrunk(planes, size).to(self.luma)
             return small.div_(_WHITE[picture.dtype]).clamp_(0.0, 1.0)
@@ -344,10 +344,10 @@ class FeatureExtractor(nn.Module):
         return _resized(planes.clamp(0.0, 1.0), size).clamp(0.0, 1.0)
 
 
-def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int] | None) -> Float[Tensor, "c y x"]:
+def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int]) -> Float[Tensor, "c y x"]:
     """Planes of whole numbers at another height and width, in single precision."""
     compiled = compiler.COMPILED and not torch.compiler.is_compiling()
-    if size is None or not compiled or planes.device.type != "cpu":
+    if planes.shape[1:] == size or not compiled or planes.device.type != "cpu":
         planes = planes.to(torch.float32, memory_format=torch.contiguous_format)
         return _resized(planes, size)
     from torchcss.vision.resample_kernels import resize, triangles
@@ -357,9 +357,9 @@ def _shrunk(planes: Int[Tensor, "c h w"], size: tuple[int, int] | None) -> Float
     return small
 
 
-def _resized(planes: Float[Tensor, "c h w"], size: tuple[int, int] | None) -> Tensor:
-    """Planes at another height and width; None: as they are."""
-    if size is None:
+def _resized(planes: Float[Tensor, "c h w"], size: tuple[int, int]) -> Float[Tensor, "c y x"]:
+    """Planes at another height and width, if it is another one."""
+    if planes.shape[1:] == size:
         return planes
     return functional.interpolate(
         planes[None], size=size, mode="bilinear", align_corners=False, antialias=True
