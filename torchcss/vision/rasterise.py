@@ -101,7 +101,9 @@ def rasterise(
     pixel = torch.nonzero(nearest >= 0)[:, 0]
     face = nearest[pixel]
 
-    table = torch.cat((place[faces].flatten(1), distance[faces], _areas(place, faces)[:, None]), -1)
+    table = torch.cat(
+        (place[faces].flatten(1), distance[faces], doubled_areas(place, faces)[:, None]), -1
+    )
     parts, weighted = _barycentric(table.index_select(0, face), pixel % width, pixel // width)
     total = weighted.sum(0)
     barycentric = uv.new_zeros(height * width, 3)
@@ -180,15 +182,22 @@ def nearest_faces(
     first = vertices * torch.arange(pictures, device=faces.device)
     every = (faces + first[:, None, None]).flatten(0, 1)
     place, distance = place.flatten(0, 1), distance.flatten()
-    drawn = usable.flatten()[every].all(-1) & (_areas(place, every).abs() > LEAST_AREA)
+    drawn = usable.flatten()[every].all(-1) & (doubled_areas(place, every).abs() > LEAST_AREA)
     drawn = torch.nonzero(drawn)[:, 0]
     nearest = _by_spans(place, distance, every, drawn, height, width, pictures)
     nearest = nearest.where(nearest < 0, label.repeat(pictures)[nearest])
     return nearest.view(pictures, height, width)
 
 
-def _areas(place: Places, faces: Faces) -> Float[Tensor, " f"]:
-    """Signed areas of triangles, doubled."""
+def doubled_areas(place: Places, faces: Faces) -> Float[Tensor, " f"]:
+    """Signed areas of triangles, doubled.
+
+    Rows count downwards: a triangle that runs anticlockwise to the eye has a negative area.
+
+    Args:
+        place: Projected vertices, pixels.
+        faces: Corner indices.
+    """
     first, second, third = place[faces].unbind(1)
     a, b = second - first, third - first
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -23,7 +23,7 @@ from torch.nn import functional
 from torchcss.body.model import BodyModel
 from torchcss.studies.render.character import distance_to_parts
 from torchcss.vision.camera import Camera
-from torchcss.vision.rasterise import interpolate, rasterise
+from torchcss.vision.rasterise import doubled_areas, interpolate, rasterise
 
 _SKIN_DEEP = 0.005
 """Metres that a point may lie behind the surface that the picture has there and count as seen."""
@@ -86,10 +86,7 @@ class MeshTruth:
         fine = rasterise(
             (uv + 0.5) * 2 - 0.5, depth, self.faces, 2 * self.height, 2 * self.width, valid=valid
         )
-        first, second, third = uv[self.faces].unbind(1)
-        a, b = second - first, third - first
-        # Rows count downwards: a triangle that runs anticlockwise to the eye has a negative area.
-        facing = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0
+        facing = doubled_areas(uv, self.faces) < 0
         return Labels(seen.face, seen.barycentric, part, seen.depth, fine.depth, world, facing)
 
     def flow(self, now: Labels, after: Labels) -> tuple[Tensor, Tensor]:
