@@ -16,7 +16,6 @@ import os
 import pickle
 import sys
 import tempfile
-import uuid
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +29,8 @@ from numba.core import compiler, ir, serialize, types
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.dispatcher import Dispatcher
 from numba.core.untyped_passes import IRProcessing
+
+from torchcss.files import replace_file
 
 _FREEDOM = {"contract", "nsz", "arcp", "reassoc"}
 """What the compiler may do to sums and products; it depends on the code alone. Infinities and NaN
@@ -145,7 +146,8 @@ class _Cache:
         for folder in cache_folders():
             with contextlib.suppress(OSError):
                 folder.mkdir(parents=True, exist_ok=True)
-                _write(folder / name, hashlib.sha256(data).digest() + data)
+                with replace_file(folder / name) as partial:
+                    partial.write_bytes(hashlib.sha256(data).digest() + data)
                 return
 
     @cached_property
@@ -169,16 +171,6 @@ def _checked(data: bytes) -> bytes:
     if hashlib.sha256(rest).digest() != digest:
         raise ValueError("damaged")
     return rest
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Write a file that appears at once and whole."""
-    beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}")
-    try:
-        beside.write_bytes(data)
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 @register_pass(mutates_CFG=False, analysis_only=False)
