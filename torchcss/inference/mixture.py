@@ -280,7 +280,7 @@ def _unlike_better(
     """
     kept = [order[:0]]
     while len(order) and most:
-        block = order[:_MODES_AT_ONCE]
+        block = order[: min(most, _MODES_AT_ONCE)]
         far = is_far(block, order).cpu().numpy()  # one transfer for all of the block
         left, own = np.ones(len(order), dtype=bool), []
         for place, others in enumerate(far):
