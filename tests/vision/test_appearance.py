@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchcss.kernels import compiler
 from torchcss.vision.appearance import BINS, Appearance, colour_bins
 
 RED, GREEN, GREY = (0.9, 0.1, 0.1), (0.1, 0.8, 0.2), (0.5, 0.5, 0.5)
@@ -67,7 +68,7 @@ def test_old_colours_are_forgotten_by_degrees_and_too_few_pixels_teach_nothing()
     torch.testing.assert_close(same.outside, known.outside)
 
 
-def test_each_mask_counts_its_own_pixels() -> None:
+def test_each_mask_counts_its_own_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     image, _ = picture()
     masks = torch.rand(3, 40, 60, generator=torch.Generator().manual_seed(0)) > 0.6
     known, bins = Appearance.unknown(3, like=image).learn(image, masks, ~masks), colour_bins(image)
@@ -76,6 +77,9 @@ def test_each_mask_counts_its_own_pixels() -> None:
             share = torch.stack([(bins[mask] == one).double().mean() for one in bins.unique()])
             torch.testing.assert_close(row[bins.unique()], share)
             assert float(row.sum()) == pytest.approx(1)
+    monkeypatch.setattr(compiler, "COMPILED", False)
+    twin = Appearance.unknown(3, like=image).learn(image, masks, ~masks)
+    assert all(torch.equal(one, other) for one, other in zip(known, twin, strict=True))
     empty = Appearance.unknown(0, like=image).learn(image, masks[:0], masks[:0])
     assert empty.inside.shape == (0, BINS**3)
 
