@@ -68,6 +68,6 @@ class SearchProblem(NamedTuple):
         """The problem of some of the samples."""
         if self.restrict is not None:
             return self.restrict(items)
-        costs = {name: getattr(self, name) for name in _COSTS}
+        costs = {name: cost for name, cost in self._asdict().items() if name in _COSTS}
         taken = {name: cost.take(items) for name, cost in costs.items() if cost is not None}
         return self._replace(**taken)
